@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from nsf import paths, usage
+from nsf import paths, usage, words
 from nsf.errors import ConfigError, NSFError, first_line, out_of_memory
 from nsf.paths import reports_folder
 from nsf.terminal import console, guard
@@ -90,7 +90,7 @@ def _dispatch(arguments: list[str]) -> int:
         return _tool("plan", [o for o in overrides if o != "--dry-run"])
     multirun = bool({"-m", "--multirun"} & set(overrides))
     overrides = [o for o in overrides if o not in ("-m", "--multirun")]
-    _check_words(stage, [o for o in overrides if not o.startswith("~")])
+    words.check(stage, [o for o in overrides if not o.startswith("~")])
     from nsf import config
 
     launcher = [o for o in overrides if config.of_launcher(o)]
@@ -122,41 +122,25 @@ def _check_scene(command: str, overrides: Sequence[str]) -> None:
         raise ConfigError(f"nsf {command} needs a scene, as scene=sand; choose one of {known}")
 
 
-def _check_words(command: str, words: Sequence[str]) -> None:
-    unknown = [word for word in words if word.startswith("-") or "=" not in word]
-    if unknown:
-        raise ConfigError(f"{unknown[0]!r} is not key=value; see `nsf {command} --help`")
-
-
-def _asked(command: str, words: Sequence[str], *known: str, dotted: bool = False) -> dict[str, str]:
-    """The values of a tool's keys, and with `dotted` of those of a configuration that have a dot."""
-    _check_words(command, words)
-    asked = dict(word.split("=", 1) for word in words)
-    if unknown := [key for key in asked if key not in known and not (dotted and "." in key)]:
-        keys = " and ".join(f"{key}=" for key in known)
-        raise ConfigError(f"nsf {command} has no key {unknown[0]!r}; it takes {keys}")
-    return asked
-
-
-def _tool(name: str, words: list[str]) -> int:
-    text, words_of = TOOLS[name]
-    if words_of is not None and {"-h", "--help"} & set(words):
-        print(f"usage: nsf {name} {words_of}\n\n{text}")
+def _tool(name: str, arguments: list[str]) -> int:
+    text, takes = TOOLS[name]
+    if takes is not None and {"-h", "--help"} & set(arguments):
+        print(f"usage: nsf {name} {takes}\n\n{text}")
         return 0
     if name in ("view", "serve"):
         from nsf.live.command import main as live
 
-        return live(name, text, words)
+        return live(name, text, arguments)
     if name in ("calibrate", "design", "sample"):
         from nsf.inverse.reports import command
 
-        return _open(getattr(command, name)(words))
+        return _open(getattr(command, name)(arguments))
     tools = {
         "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index, "init": _init,
         "plan": _plan,
         "reports": _reports, "runs": _runs, "search": _search,
     }  # fmt: skip
-    return tools[name](words)
+    return tools[name](arguments)
 
 
 def _open(page: Path) -> int:
@@ -165,85 +149,84 @@ def _open(page: Path) -> int:
     return 0
 
 
-def _bench(words: list[str]) -> int:
+def _bench(arguments: list[str]) -> int:
     """Benchmarks, and the report of all there are."""
-    asked = _asked(
-        "bench", words, "benches", "particles", "precision", "device", "trials", "scenes", "limit", "folder",
-        dotted=True,
-    )  # fmt: skip
+    keys = ("benches", "particles", "precision", "device", "trials", "scenes", "limit", "folder")
+    settings = [key for key in words.pairs("bench", arguments) if "." in key]
+    options = words.values("bench", arguments, dict.fromkeys((*keys, *settings), words.text))
     from nsf.bench import bench, table
 
-    folder = asked.pop("folder", reports_folder("speed"))
-    page = bench(folder, asked, lambda text: print(text, file=sys.stderr))
+    folder = options.pop("folder", reports_folder("speed"))
+    page = bench(folder, options, lambda text: print(text, file=sys.stderr))
     _console().print(table(page.with_name("bench.csv")))
     return _open(page)
 
 
-def _doctor(words: list[str]) -> int:
+def _doctor(arguments: list[str]) -> int:
     """Versions, devices and extras of this installation."""
-    if words:
-        raise ConfigError(f"nsf doctor takes nothing, not {words[0]!r}")
+    if arguments:
+        raise ConfigError(f"nsf doctor takes nothing, not {arguments[0]!r}")
     from nsf.doctor import report
 
     print(report())
     return 0
 
 
-def _export(words: list[str]) -> int:
+def _export(arguments: list[str]) -> int:
     """A deployed run in other programs' formats."""
     from nsf.export.command import main as export
 
-    return export(words)
+    return export(arguments)
 
 
-def _demo(words: list[str]) -> int:
+def _demo(arguments: list[str]) -> int:
     """A page of a model that comes with the package."""
-    asked = _asked("demo", words, "model", "folder", "open")
+    readers = {"model": words.text, "folder": words.text, "open": words.flag}
+    options = words.values("demo", arguments, readers)
     from nsf.live.demo import show
 
-    folder = asked.get("folder", reports_folder("demo"))
-    return _open(show(asked.get("model"), folder, asked.get("open", "true")))
+    folder = Path(options.get("folder", reports_folder("demo")))
+    return _open(show(options.get("model"), folder, options.get("open", True)))
 
 
-def _index(words: list[str]) -> int:
+def _index(arguments: list[str]) -> int:
     """The page of all runs."""
-    asked = _asked("index", words, "folder")
-    folder = asked.get("folder", reports_folder("runs"))
+    options = words.values("index", arguments, {"folder": words.text})
     from nsf.results.overview.index import write_index
 
-    return _open(write_index(Path(folder)))
+    return _open(write_index(Path(options.get("folder", reports_folder("runs")))))
 
 
-def _init(words: list[str]) -> int:
+def _init(arguments: list[str]) -> int:
     """A project of the user."""
-    if len(words) != 1 or words[0].startswith("-"):
+    if len(arguments) != 1 or arguments[0].startswith("-"):
         raise ConfigError("nsf init needs one folder, as nsf init my_project")
     from nsf.init import write_project
 
-    folder = Path(words[0])
+    folder = Path(arguments[0])
     write_project(folder)
     print(f"wrote {folder}; next: cd {folder}, pip install -e . and nsf run --config-dir conf scene=bracket")
     return 0
 
 
-def _plan(words: list[str]) -> int:
+def _plan(arguments: list[str]) -> int:
     """The stages of a run and their states, before any work."""
     from nsf import config
     from nsf.pipeline import preview
 
     flags = {"-m", "--multirun", "--cfg"}
-    asked = [word for word in words if word not in flags]
-    _check_words("plan", [word for word in asked if not word.startswith("~")])
-    own = [o for o in asked if not o.startswith("+experiment=") and not config.of_launcher(o)]
-    if names := [o.removeprefix("+experiment=") for o in asked if o.startswith("+experiment=")]:
+    overrides = [word for word in arguments if word not in flags]
+    words.check("plan", [word for word in overrides if not word.startswith("~")])
+    own = [o for o in overrides if not o.startswith("+experiment=") and not config.of_launcher(o)]
+    if names := [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]:
         from nsf.pipeline.experiment import Experiment
 
         jobs = [job.overrides for job in Experiment.load(names[-1], own).jobs]
     else:
         _check_scene("plan", own)
-        jobs = config.jobs([own]) if {"-m", "--multirun"} & set(words) else [tuple(own)]
+        jobs = config.jobs([own]) if {"-m", "--multirun"} & set(arguments) else [tuple(own)]
     found = preview.plans(jobs)
-    if "--cfg" in words:
+    if "--cfg" in arguments:
         print("\n---\n".join(map(preview.composed, found)), end="")
         return 0
     console = _console()
@@ -253,43 +236,40 @@ def _plan(words: list[str]) -> int:
     return 0
 
 
-def _reports(words: list[str]) -> int:
+def _reports(arguments: list[str]) -> int:
     """The page of all reports and their charts, or what is wrong with them; 2 if something is."""
-    asked = _asked("reports", words, "folder", "check", "html")
-    for key in ("check", "html"):
-        if asked.get(key, "true") not in ("true", "false"):
-            raise ConfigError(f"{key}={asked[key]} must be true or false")
+    readers = {"folder": words.text, "check": words.flag, "html": words.flag}
+    options = words.values("reports", arguments, readers)
     from nsf.pipeline.experiment import questions
     from nsf.results.committed import faults, write_list
 
-    folder = Path(asked.get("folder", reports_folder()))
+    folder = Path(options.get("folder", reports_folder()))
     if not folder.is_dir():
         raise ConfigError(f"folder={folder} is no folder; name one that holds reports, or make one")
-    if asked.get("check") != "true":
-        print(f"open {write_list(folder, asked.get('html') == 'true', questions()).resolve()}")
-        return 0
-    found = faults(folder, questions())
-    told = found or [f"every report in {folder} is as it was generated"]
-    print(*told, sep="\n", file=sys.stderr if found else sys.stdout)
-    return 2 if found else 0
+    if not options.get("check"):
+        return _open(write_list(folder, options.get("html", False), questions()))
+    differing = faults(folder, questions())
+    lines = differing or [f"every report in {folder} is as it was generated"]
+    print(*lines, sep="\n", file=sys.stderr if differing else sys.stdout)
+    return 2 if differing else 0
 
 
-def _search(words: list[str]) -> int:
+def _search(arguments: list[str]) -> int:
     """Trials until there are enough, and the best of them."""
-    _check_words("search", words)
+    words.check("search", arguments)
     from nsf.pipeline.search import search
     from nsf.results.search import best_table
 
-    chart = search(words)
+    chart = search(arguments)
     _console().print(best_table(chart.with_name("trials.csv")))
     return _open(chart)
 
 
-def _runs(words: list[str]) -> int:
+def _runs(arguments: list[str]) -> int:
     """Runs listed, shown, compared, verified or deleted."""
     from nsf.results.overview.command import main as runs
 
-    return runs(words, lambda table: _console().print(table))
+    return runs(arguments)
 
 
 def _stages(stage: str) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ TOOLS = {
         "       [sensitivities=1024] [full_order=0] [observations=FILE] [program=N] [seed=0] [folder=PATH]",
     ),
     "design": (
-        "a program of forcing that brings a target about, by gradients, and the full-order run along it",
+        "a program of forcing that brings a target about, by least squares, and the full-order run along it",
         "target=FILE|height=0.1|x@X:Y:Z=0.5 tilt=ANGLE|move=SOLID,SOLID [run=RUN] [NAME=VALUE …] [knots=6]\n"
         "       [full_order=true] [seed=0] [device=auto] [folder=PATH]",
     ),

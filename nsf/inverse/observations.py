@@ -18,12 +18,12 @@ from nsf.inverse.columns import COLUMNS, read_columns
 from nsf.inverse.model import Model
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Restriction
+from nsf.words import NUMBER
 
 _Positions = Callable[[np.ndarray], Tensor]
 AXES = ("x", "y", "z")
 _POINT = ("X", "Y", "Z")
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_COMPONENT = re.compile(rf"([xyz])@({_NUMBER}):({_NUMBER}):({_NUMBER})")
+_COMPONENT = re.compile(rf"([xyz])@({NUMBER}):({NUMBER}):({NUMBER})")
 #: Particles that a scalar of a shape is taken from.
 BODY = 1000
 #: Of Δt: how far a time may be outside of a run.

@@ -28,25 +28,19 @@ def page_of(model: str) -> str:
     return page.html(MODELS[model], zlib.decompress(data))
 
 
-def show(
-    model: str | None,
-    folder: Path | str,
-    opened: str = "true",
-) -> Path:
+def show(model: str | None, folder: Path, opened: bool = True) -> Path:
     """Write the page of a shipped model, and open it in the browser.
 
     Args:
         model: a key of `MODELS`; the first by default.
         folder: of the page.
-        opened: `true` or `false`: whether it is opened.
+        opened: whether it is opened.
 
     Raises:
-        ConfigError: there is no such model, or `opened` is neither.
+        ConfigError: there is no such model.
     """
-    if opened not in ("true", "false"):
-        raise ConfigError(f"open={opened} must be true or false")
     model = next(iter(MODELS)) if model is None else model
-    path = page.saved(Path(folder) / f"{model}.html", page_of(model))
-    if opened == "true":
+    path = page.saved(folder / f"{model}.html", page_of(model))
+    if opened:
         webbrowser.open(path.resolve().as_uri())
     return path

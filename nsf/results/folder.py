@@ -1,16 +1,15 @@
 """A folder that is replaced whole or not at all."""
 
 import json
-import re
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from nsf.errors import ConfigError, StorageError
-from nsf.storage import in_use, locked
+from nsf.storage import locked
 
 MARK = "sources.json"
 """The file by which a folder is known as a report: it names every other file of the folder."""
@@ -18,7 +17,6 @@ MARK = "sources.json"
 PROVENANCE = "provenance.json"
 """The file of a folder of reports that names what is committed of each."""
 
-_LEFT = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-\w{8}")  # beside a folder while it is replaced
 _PAGES = ("index.html", "index.md", "results.csv", "results.tex", "superresolution.csv")
 _MOST_BYTES = 2**26  # of a record
 
@@ -111,11 +109,11 @@ def _no_place(folder: Path, error: OSError) -> StorageError:
 
 @contextmanager
 def replaced(folder: Path) -> Iterator[Path]:
-    """An empty sibling folder to write into; it takes `folder`'s place once the block ends without an error.
+    """An empty folder to write into; it takes `folder`'s place once the block ends without an error.
 
     Until then, and after any error or interrupt, whatever stood at `folder` stands there unchanged. Two
-    processes that replace it do so in turn, by the lock `.<name>.lock` beside it, which stays; what a killed
-    process left beside it is removed.
+    processes that replace it do so in turn, by the lock `.<name>.lock` beside it, which stays. What a killed
+    process left in `.<name>.partial` is removed, or put back, by the next one.
 
     Raises:
         ConfigError: `folder` holds a file that no report wrote.
@@ -123,56 +121,34 @@ def replaced(folder: Path) -> Iterator[Path]:
     """
     folder = Path(folder).absolute()
     check_place(folder)
-    _clear(folder.parent)
+    lock, work = (folder.with_name(f".{folder.name}.{end}") for end in ("lock", "partial"))
+    fresh, old = work / "new", work / "old"
     waiting = f"waiting for another process, which writes {folder}"
-    with locked(_lock(folder), waiting=lambda: print(waiting, file=sys.stderr)):
+    with locked(lock, waiting=lambda: print(waiting, file=sys.stderr)):
         try:
-            fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+            if old.is_dir() and not folder.exists():
+                old.rename(folder)
+            shutil.rmtree(work, ignore_errors=True)
+            fresh.mkdir(parents=True)
         except OSError as error:
             raise _no_place(folder, error) from error
         try:
             yield fresh
-            fresh.chmod(0o755)
-            _take_place(fresh, folder)
+            _take_place(fresh, folder, old)
         except OSError as error:
             raise StorageError(
                 f"the report for {folder} was not written: {error}; the old one, if any, stands"
             ) from error
         finally:
-            shutil.rmtree(fresh, ignore_errors=True)
+            shutil.rmtree(work, ignore_errors=True)
 
 
-def _lock(folder: Path) -> Path:
-    """Its holder, and nobody else, has folders beside `folder` that are to replace it."""
-    return folder.with_name(f".{folder.name}.lock")
-
-
-def _clear(reports: Path) -> None:
-    """Remove what killed processes left in a folder of reports; a report that was put aside comes back.
-
-    A folder of such a name beside which there is no lock, or one put aside that is no report, is of others.
-    """
-    for left in sorted(reports.iterdir()):
-        parts = _LEFT.fullmatch(left.name)
-        if not parts or not _lock(folder := reports / parts["name"]).is_file():
-            continue
-        with suppress(OSError, StorageError):  # of someone else
-            if in_use(_lock(folder)) or (parts["kind"] == "old" and _of_others(left)):
-                continue
-            if parts["kind"] == "old" and not folder.exists():
-                left.rename(folder)
-            shutil.rmtree(left, ignore_errors=True)
-
-
-def _take_place(fresh: Path, folder: Path) -> None:
-    if not folder.exists():
-        fresh.rename(folder)
-        return
-    old = fresh.with_name(fresh.name.replace(".new-", ".old-"))
-    folder.rename(old)
+def _take_place(fresh: Path, folder: Path, old: Path) -> None:
+    if folder.exists():
+        folder.rename(old)
     try:
         fresh.rename(folder)
     except BaseException:
-        old.rename(folder)
+        if old.exists():
+            old.rename(folder)
         raise
-    shutil.rmtree(old)

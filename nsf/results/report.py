@@ -183,11 +183,11 @@ def told_apart(sources: Sequence[Source]) -> dict[str, dict[str, str]]:
     """By run id, the keys in which runs without an experiment differ, but for those that columns say."""
     cache: dict = {}
     entries = [Entry(source.run, cache) for source in sources]
-    differ = differing(entries)
-    keys = [key for key in (*differ.keys, *differ.more) if key not in _OF_COLUMNS]
-    keys = [key for key in keys if not key.startswith(_PASSING)][:_MOST]
+    keys = [key for key in differing(entries) if key not in _OF_COLUMNS and not key.startswith(_PASSING)]
     return {
-        entry.run.id: {key: str(value) for key in keys if (value := entry.settings.get(key)) is not None}
+        entry.run.id: {
+            key: str(value) for key in keys[:_MOST] if (value := entry.settings.get(key)) is not None
+        }
         for entry in entries
     }
 

@@ -1,8 +1,7 @@
-"""Keys in which listed runs differ, and their units."""
+"""Keys in which listed runs differ, their units, and the rows of a list."""
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -10,92 +9,82 @@ from nsf.paths import files
 from nsf.runs.listing import ABSENT, FIELDS, Entry, text, value_of
 
 CASE = "case"
-#: Keys that are shown first, and what they are called.
-TITLES = {
-    CASE: CASE,
-    "latent_dim": "r",
-    "sampler.size": "|S|",
-    "model": "model",
-    "stress": "stress",
-    "affine": "affine",
-    "field": "field",
-    "sampler": "sampler",
-    "seed": "seed",
-    "scale": "scale",
-    "precision": "precision",
-    "device": "device",
+#: Keys that are shown first, and their titles.
+TITLES = {CASE: CASE, "latent_dim": "r", "sampler.size": "|S|"} | {
+    key: key
+    for key in ("model", "stress", "affine", "field", "sampler", "seed", "scale", "precision", "device")
 }
-_MOST = 6  # further keys that differ and have a column
-_WIDEST = 28  # characters of a cell
 #: Keys that say the same as another, or that no reader looks for.
-_SAID = re.compile(r"_target_$|^(parameters|cases|validation|teaching_cases|files|model\.name|paper)\b")
+_HIDDEN = re.compile(r"_target_$|^(parameters|cases|validation|teaching_cases|files|model\.name|paper)\b")
 #: Units of metrics by the end of their name; δ and other errors are shown in per cent.
 _METRICS = {"seconds": "s", "ms": "ms", "mib": "MiB", "bytes": "B"}
 _PERCENT = re.compile(r"(^|_)(delta|error)$")
 #: Keys that a case replaces, which the column of cases shows.
 _PARAMETER_KEY = re.compile(r"parameters\.\w+\.key")
+_PARAMETER_VALUE = re.compile(r"parameters\.(\w+)\.value")
 _UNIT = re.compile(r"^\s*(\w+):[^#\n]*#\s*\[([^\]\d][^\]]*)\]", re.M)
 
 
-@dataclass(frozen=True)
-class Differing:
-    """Keys by which runs differ.
+def differing(listed: Sequence[Entry], named: Iterable[str] = ()) -> list[str]:
+    """The keys in which runs of one stage and scene differ, the best known first, and those that are named.
 
-    Attributes:
-        keys: that have a column.
-        more: that differ as well.
+    A key that parts the runs as an earlier one does is left out, unless it is named.
     """
-
-    keys: tuple[str, ...]
-    more: tuple[str, ...] = ()
-
-
-def differing(found: Sequence[Entry], asked: Iterable[str] = ()) -> Differing:
-    """The keys in which runs of one stage and scene differ, and those that are asked for.
-
-    Args:
-        found: the runs.
-        asked: keys that were filtered or sorted by.
-    """
-    groups: dict[tuple[str, str], list[Entry]] = {}
-    for entry in found:
-        groups.setdefault((entry.run.stage, entry.run.scene), []).append(entry)
-    differ: dict[str, None] = {}
+    named = [key for key in dict.fromkeys(named) if key not in FIELDS]
     replaced = {
-        value for entry in found for key, value in entry.settings.items() if _PARAMETER_KEY.fullmatch(key)
+        value for entry in listed for key, value in entry.settings.items() if _PARAMETER_KEY.fullmatch(key)
     }
-    for entries in groups.values():
-        known = dict.fromkeys(key for entry in entries for key in (*TITLES, *entry.settings))
-        for key in known:
-            # Some have no such key at all, as those of a recurrence.
-            values = {cell(entry, key) for entry in entries} - {ABSENT}
-            if not _SAID.search(key) and key not in replaced and len(values) > 1:
-                differ[key] = None
-    own = [key for key in dict.fromkeys(asked) if key not in FIELDS]
-    first = [key for key in TITLES if key in differ and key not in own]
-    rest = [key for key in differ if key not in TITLES and key not in own]
-    return Differing((*first, *own, *rest[:_MOST]), tuple(rest[_MOST:]))
+    keys = dict.fromkeys([*TITLES, *(key for entry in listed for key in entry.settings)])
+    differ, partings = [], set()
+    for key in keys:
+        if key in named or key in replaced or _HIDDEN.search(key) or not _differs(listed, key):
+            continue
+        parting = tuple(text(setting(entry, key)) for entry in listed)
+        if key in TITLES or parting not in partings:
+            differ.append(key)
+        partings.add(parting)
+    first = [key for key in differ if key in TITLES]
+    return [*first, *named, *(key for key in differ if key not in TITLES)]
 
 
-def cell(entry: Entry, key: str) -> str:
-    """A setting of a run as shown."""
-    shown = case_of(entry) if key == CASE else text(value_of(entry, key))
-    return shown if len(shown) <= _WIDEST else f"{shown[: _WIDEST - 1]}…"
+def _differs(listed: Sequence[Entry], key: str) -> bool:
+    """Whether runs of one stage and scene have different values; some have no such key at all."""
+    values: dict[tuple[str, str], set[str]] = {}
+    for entry in listed:
+        values.setdefault((entry.run.stage, entry.run.scene), set()).add(text(setting(entry, key)))
+    return any(len(several - {ABSENT}) > 1 for several in values.values())
 
 
-def case_of(entry: Entry) -> str:
+def setting(entry: Entry, key: str) -> Any:
+    """A field, metric or setting of a run, or its case; None where it has none."""
+    return case_of(entry) if key == CASE else value_of(entry, key)
+
+
+def case_of(entry: Entry) -> str | None:
     """The parameter values of a simulation, or those that a run was deployed at."""
     cases = entry.settings.get("cases")
     if entry.run.stage == "simulate":
         values = {
-            found[1]: value
+            match[1]: value
             for key, value in entry.settings.items()
-            if (found := re.fullmatch(r"parameters\.(\w+)\.value", key))
+            if (match := _PARAMETER_VALUE.fullmatch(key))
         }
         cases = [values] if values else None
     if not (isinstance(cases, list) and all(isinstance(case, dict) for case in cases)):
-        return ABSENT
-    return "; ".join(", ".join(text(value) for value in case.values()) for case in cases)
+        return None
+    return "; ".join(", ".join(map(text, case.values())) for case in cases)
+
+
+def records(listed: Sequence[Entry], named: Iterable[str] = ()) -> list[dict[str, Any]]:
+    """A row a run: its fields, the keys of `differing`, every metric, unrounded, and its `path`."""
+    keys, fields = differing(listed, named), [field for field in FIELDS if field != "metric"]
+    return [
+        {field: entry.values[field] for field in fields}
+        | {key: setting(entry, key) for key in keys}
+        | entry.metrics
+        | {"path": str(entry.run.path)}
+        for entry in listed
+    ]
 
 
 def title_of(key: str) -> str:
@@ -109,8 +98,7 @@ def unit_of(key: str) -> str:
     part, *_, leaf = ("", *key.split(".")) if "." not in key else key.split(".")
     if _PERCENT.search(leaf):
         return "%"
-    known = _units().get(part, {})
-    return known.get(leaf) or _METRICS.get(leaf.rpartition("_")[2] or leaf, "")
+    return _units().get(part, {}).get(leaf) or _METRICS.get(leaf.rpartition("_")[2] or leaf, "")
 
 
 def scaled(key: str, value: Any) -> Any:
@@ -122,12 +110,12 @@ def scaled(key: str, value: Any) -> Any:
 @cache
 def _units() -> dict[str, dict[str, str]]:
     """Units by the first and the last part of a key, from the comments of `conf/`: `dx: 0.01  # [m]`."""
-    found: dict[str, dict[str, str]] = {}
+    units: dict[str, dict[str, str]] = {}
     for path in reversed(files()):
         group = path.parent.name
         for name, unit in _UNIT.findall(path.read_text(encoding="utf-8")):
             # A scene's file has the keys of its material, too.
             for part in ("scene", "material") if group == "scene" else (group,):
                 if unit != "-":
-                    found.setdefault(part, {}).setdefault(name, unit)
-    return found
+                    units.setdefault(part, {}).setdefault(name, unit)
+    return units

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nsf.errors import ConfigError
-from nsf.runs.listing import FIELDS, entries, text, value_of
+from nsf import words as words_of
+from nsf.runs.listing import FIELDS, entries, text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,26 +33,14 @@ def table(
     """
     import pandas as pd
 
-    from nsf.runs.columns import CASE, case_of, differing
+    from nsf.runs.columns import records
 
-    asked = _filters(words) | {key: _wanted(value) for key, value in filters.items()}
-    found = entries(asked, sort, None if root is None else Path(root))
-    keys = differing(found, asked)
-    rows = []
-    for entry in found:
-        own = {key: case_of(entry) if key == CASE else value_of(entry, key) for key in keys.keys + keys.more}
-        fields = {field: entry.values[field] for field in FIELDS if field != "metric"}
-        rows.append(fields | own | entry.metrics | {"path": str(entry.run.path)})
+    wanted = words_of.pairs("runs", words) | {key: _texts(value) for key, value in filters.items()}
+    rows = records(entries(wanted, sort, None if root is None else Path(root)), wanted)
     frame = pd.DataFrame(rows, columns=None if rows else [*FIELDS[:-1], "path"])
     frame["created"] = pd.to_datetime(frame["created"], utc=True, format="ISO8601")
     return frame
 
 
-def _filters(words: tuple[str, ...]) -> dict[str, str]:
-    if wrong := [word for word in words if "=" not in word]:
-        raise ConfigError(f"{wrong[0]!r} is not key=value")
-    return dict(word.split("=", 1) for word in words)
-
-
-def _wanted(value: Any) -> str:
+def _texts(value: Any) -> str:
     return ",".join(map(text, value)) if isinstance(value, list | tuple) else text(value)

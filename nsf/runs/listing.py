@@ -1,14 +1,14 @@
 """Runs as they are listed, filtered and sorted: from manifests and configurations alone."""
 
 import difflib
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from dataclasses import field as attribute
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from nsf.errors import ConfigError
 from nsf.paths import groups, option
@@ -16,15 +16,15 @@ from nsf.runs.run import Run
 
 #: What a user sees of each run first.
 FIELDS = ("stage", "scene", "id", "created", "status", "seconds", "metric")
-#: The metric that stands for a stage, and how it is told.
+#: The metric that stands for a stage, and its title.
 MAIN = {
     "evaluate": ("delta", "δ"),
     "superresolve": ("delta", "δ"),
     "train": ("deformation_loss", "loss of g"),
 }
-#: What is shown in place of a value that is not there.
+#: Shown in place of a value that a run lacks.
 ABSENT = "–"
-#: Groups whose option a run's settings tell, by the class that it names.
+#: Groups whose option a run's settings tell, by the class that they name.
 _GROUPS = ("field", "trainer", "sampler", "projector", "integration")
 _GENERATIONS = 32  # of runs, each made from the one before; a chain has five
 ORIGIN = ("commit", "dirty", "device", "seed", "precision", "versions")
@@ -36,11 +36,11 @@ class Entry:
 
     Attributes:
         run: whole, half-made or broken.
-        known: settings of runs by run, which entries that are listed together share.
+        cache: settings by run, which entries that are listed together share.
     """
 
     run: Run
-    known: dict[Run, dict[str, Any]] = attribute(default_factory=dict, repr=False, compare=False)
+    cache: dict[Run, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @cached_property
     def fault(self) -> str | None:
@@ -74,112 +74,101 @@ class Entry:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """The configuration by dotted key: of the runs that this one goes back to, and on top its own.
+        """The run's configuration by dotted key, over that of the runs that it was made from.
 
         Where those runs differ, as simulations do in their parameter, the values are a tuple. A broken run
-        has none. Groups are there by the option that was chosen, such as `field` and `method`.
+        has none. Groups are named by their option, as `field` and `sampler`.
         """
-        return _with_options(_settings(self.run, self.known, _GENERATIONS))
+        settings = _settings(self.run, self.cache, _GENERATIONS)
+        options = {group: _option(group, settings) for group in _GROUPS}
+        options["model"] = settings.get("model.name")
+        return settings | {group: name for group, name in options.items() if name is not None}
 
 
-def entries(filters: Mapping[str, str] | None = None, sort: str = "-created", root: Path | None = None):
+def entries(
+    filters: Mapping[str, str] | None = None, sort: str = "-created", root: Path | None = None
+) -> list[Entry]:
     """The runs that pass every filter, sorted.
 
     Args:
-        filters: by field, metric or key of the configuration (of the run or those it goes back to): the
+        filters: by field, metric or key of the configuration (of the run or those it was made from): the
             value it must have; several are parted by commas, and `*` stands for anything.
         sort: field, metric or key; from the largest down with a leading `-`. Runs without it come last.
         root: folder of all runs; NSF_RUNS, else ./runs.
 
-    Returns:
-        A list of `Entry`.
-
     Raises:
         ConfigError: there are runs, and none has such a key; names the nearest.
     """
-    known: dict[Run, dict[str, Any]] = {}
-    found = [Entry(run, known) for run in Run.find(root=root)]
+    cache: dict[Run, dict[str, Any]] = {}
+    chosen = [Entry(run, cache) for run in Run.find(root=root)]
     key = sort.removeprefix("-")
     for name in (*(filters or ()), key):
-        _check_key(name, found)
+        _check_key(name, chosen)
     for name, wanted in (filters or {}).items():
-        found = [entry for entry in found if _matches(value_of(entry, name), wanted)]
-    there = [entry for entry in found if value_of(entry, key) is not None]
-    there.sort(key=lambda entry: _order(value_of(entry, key)), reverse=sort.startswith("-"))
-    return there + [entry for entry in found if value_of(entry, key) is None]
+        chosen = [entry for entry in chosen if _matches(value_of(entry, name), wanted)]
+    valued = [entry for entry in chosen if value_of(entry, key) is not None]
+    valued.sort(key=lambda entry: _order(value_of(entry, key)), reverse=sort.startswith("-"))
+    return valued + [entry for entry in chosen if value_of(entry, key) is None]
 
 
-def _settings(run: Run, known: dict[Run, dict[str, Any]], generations: int) -> dict[str, Any]:
-    """As `Entry.settings`; `known` ends the search where a run goes back to itself."""
-    if run in known:
-        return known[run]
+def _settings(run: Run, cache: dict[Run, dict[str, Any]], generations: int) -> dict[str, Any]:
+    """Settings without options of groups; `cache` ends the search where a run goes back to itself."""
+    if run in cache:
+        return cache[run]
     if not generations:
         return {}
-    known[run] = {}
+    cache[run] = {}
     if not run.manifest or run.fault:
         return {}
-    found: dict[str, list[Any]] = {}
+    several: dict[str, list[Any]] = {}
     for parent in run.parent_runs:
-        for key, value in _settings(parent, known, generations - 1).items():
-            values = found.setdefault(key, [])
+        for key, value in _settings(parent, cache, generations - 1).items():
+            values = several.setdefault(key, [])
             values += [v for v in (value if isinstance(value, tuple) else (value,)) if v not in values]
-    inherited = {key: values[0] if len(values) == 1 else tuple(values) for key, values in found.items()}
-    known[run] = inherited | flat(run.config)
-    return known[run]
-
-
-def _with_options(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings with the option of each group that they come from."""
-    found = {group: _option(group, settings) for group in _GROUPS}
-    found["model"] = settings.get("model.name")
-    return settings | {group: option for group, option in found.items() if option is not None}
+    inherited = {key: values[0] if len(values) == 1 else tuple(values) for key, values in several.items()}
+    cache[run] = inherited | flat(run.config)
+    return cache[run]
 
 
 def _option(group: str, settings: dict[str, Any]) -> str | None:
-    """The option that settings come from: of those of their class that whose keys, then values, fit best.
+    """The option of a group that settings come from: of those of their class the one they share most with.
 
-    A class that no option of this checkout has is told by its name.
+    A class that no option of this checkout has is called by its name.
     """
     target = settings.get(f"{group}._target_")
     if not isinstance(target, str):
         return None
-    options = _options(group).get(target, {})
-    own = {key.split(".")[1]: value for key, value in settings.items() if key.startswith(f"{group}.")}
+    names = {key.split(".")[1] for key in settings if key.startswith(f"{group}.")}
 
-    def fit(option: str) -> tuple[int, int, int]:
-        keys = options[option]
-        alike = sum(text(own.get(key)) == value for key, value in keys.items())
-        return -len(keys.keys() - own.keys()), len(keys), alike
+    def shared(keys: dict[str, Any]) -> tuple[int, int]:
+        alike = sum(settings.get(f"{group}.{key}") == value for key, value in keys.items())
+        return -len(keys.keys() ^ names), alike
 
-    return max(options, key=fit, default=target.rpartition(".")[2])
+    options = {name: keys for name, keys in _options(group).items() if keys["_target_"] == target}
+    return max(options, key=lambda name: shared(options[name]), default=target.rpartition(".")[2])
 
 
 @cache
-def _options(group: str) -> dict[str, dict[str, dict[str, str]]]:
-    """The options of each class of a group, with their keys and values as they stand."""
-    found: dict[str, dict[str, dict[str, str]]] = {}
-    for path in (option(group, name) for name in groups().get(group, ())):
-        keys = dict(
-            re.findall(r"^(\w+):[ \t]*([^\n#]*?)[ \t]*(?:#.*)?$", path.read_text(encoding="utf-8"), re.M)
-        )
-        if target := keys.pop("_target_", None):
-            found.setdefault(target, {})[path.stem] = keys
-    return found
+def _options(group: str) -> dict[str, dict[str, Any]]:
+    """The keys and values of each option of a group that names a class."""
+    files = {name: option(group, name).read_text(encoding="utf-8") for name in groups().get(group, ())}
+    options = {name: yaml.safe_load(text) for name, text in files.items()}
+    return {name: keys for name, keys in options.items() if isinstance(keys, dict) and "_target_" in keys}
 
 
-def _check_key(key: str, found: Sequence[Entry]) -> None:
-    if not found or key in FIELDS or any(key in entry.values or key in entry.settings for entry in found):
+def _check_key(key: str, listed: Sequence[Entry]) -> None:
+    if not listed or key in FIELDS or any(key in entry.values or key in entry.settings for entry in listed):
         return
-    known = dict.fromkeys([*FIELDS, *(k for entry in found for k in (*entry.values, *entry.settings))])
-    near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+    keys = dict.fromkeys([*FIELDS, *(k for entry in listed for k in (*entry.values, *entry.settings))])
+    near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"choose {', '.join(FIELDS)}, a metric or a key"
     raise ConfigError(f"no run has {key!r}; {hint}")
 
 
 def value_of(entry: Entry, key: str):
     """A field, metric or setting of a run; None where it has none."""
-    found = entry.values.get(key)
-    return entry.settings.get(key) if found is None else found
+    value = entry.values.get(key)
+    return entry.settings.get(key) if value is None else value
 
 
 def _matches(value, wanted: str) -> bool:

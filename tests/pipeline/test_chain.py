@@ -24,7 +24,7 @@ from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
 from nsf.pipeline.stages import evaluation
 from nsf.results.columns import EVALUATED
-from nsf.results.overview.tables import cells
+from nsf.results.overview.tables import Column
 from nsf.results.sources import open_sources
 from nsf.runs import Run
 from nsf.runs.listing import entries
@@ -483,7 +483,7 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     assert pipeline.deployment.manifest["metrics"]["diverged"] == [26.0]
     assert pipeline.evaluation.manifest["metrics"]["diverged"] == ["friction_angle=26°"]
     (listed,) = entries({"stage": "evaluate"}, root=root)
-    assert cells(listed, ())[-1].text == "diverged"
+    assert Column("metric").text(listed) == "diverged"
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert (results[["delta", "displacement_error", "stress_error"]] == np.inf).all().all()
     costs = [

@@ -1,5 +1,7 @@
 """`nsf runs` and its Python twin: what tells runs apart, what may go, and the run of exactly these keys."""
 
+import io
+import json
 import os
 import re
 
@@ -61,11 +63,11 @@ def test_columns_are_what_differs_among_the_runs_shown(root, nsf):
     code, out, _ = nsf("stage=train")
     head, *body = rows(out)
     assert code == 0
-    assert head[-3:] == ["metric", "r", "seed"]
-    assert {tuple(row[-2:]) for row in body} == {("4", "0"), ("6", "2"), ("8", "0")}
+    assert head[-2:] == ["r", "seed"]
+    assert {tuple(row[-2:]) for row in body[:3]} == {("4", "0"), ("6", "2"), ("8", "0")}
     _, out, _ = nsf("stage=simulate", "scene=sand")
     assert rows(out)[0][-1] == "case"
-    assert {row[-1] for row in rows(out)[1:]} == {"1", "2"}
+    assert {row[-1] for row in rows(out)[1:3]} == {"1", "2"}
     _, out, _ = nsf("stage=evaluate")
     assert rows(out)[0][-1] == "metric"  # of one run, nothing differs
 
@@ -76,11 +78,39 @@ def test_a_filtered_key_is_shown_although_all_have_it(root, nsf):
     assert rows(out)[1][-2:] == ["2", "projected"]
 
 
+def test_a_narrow_terminal_shows_whole_cells_of_fewer_columns(root, nsf, monkeypatch):
+    whole = nsf("stage=train")[1]
+    monkeypatch.setenv("COLUMNS", "40")
+    code, out, _ = nsf("stage=train")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 40
+    head, *body = rows(out)
+    assert head == ["id", "status", "r", "seed"] != rows(whole)[0]
+    assert {"4", "6", "8"} == {row[-2] for row in body[:3]}
+    assert all(row[0] in whole for row in body[:3])
+
+
+def test_cases_of_several_parameters_are_numbered(root, nsf):
+    for E in (1.0, 2.0):
+        of = {name: {"key": f"material.{name}", "value": v} for name, v in (("E", E), ("nu", 0.3))}
+        made("simulate", {"parameters": of}, scene="block")
+    _, out, _ = nsf("scene=block")
+    assert [row[-1] for row in rows(out)[1:3]] == ["1", "2"]
+    assert "case 1: 2, 0.3" in out
+
+
+def test_other_programs_read_json_and_csv(root, nsf):
+    listed = json.loads(nsf("stage=evaluate", "--json")[1])
+    assert [(row["delta"], row["status"]) for row in listed] == [(0.02, "complete")]
+    frame = pd.read_csv(io.StringIO(nsf("stage=train", "sort=latent_dim", "--csv")[1]))
+    assert frame["latent_dim"].tolist() == [4, 6, 8]
+
+
 def test_keys_that_only_some_runs_have_are_no_difference(root):
     made("train", {"latent_dim": 4, "seed": 0, "teaching": {"width": 96}})
-    assert "teaching.width" not in differing(entries({"stage": "train"})).keys
+    assert "teaching.width" not in differing(entries({"stage": "train"}))
     made("train", {"latent_dim": 4, "seed": 0, "teaching": {"width": 48}})
-    assert "teaching.width" in differing(entries({"stage": "train"})).keys
+    assert "teaching.width" in differing(entries({"stage": "train"}))
 
 
 def test_one_run_in_full(root, nsf):

@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.results.columns import axis
-from nsf.results.style import FULL, GRID, INK, MUTED, PALETTE, figure, legend, line_style, styled
+from nsf.results.style import FULL, GRID, INK, MUTED, PALETTE, figure, legend, line_style, panels, styled
 
 _BODY = 1500  # particles that show a body
 _RUNS = {"fitted": "run by recurrence", "full_order": "full-order run"}
@@ -22,11 +22,9 @@ def trials_chart(table: pd.DataFrame, units: Mapping[tuple[str, str], str]) -> F
         units: of the parameters, by scene and name.
     """
     groups = list(table.groupby(["scene", "parameter"], sort=False))
-    rows = (len(groups) + 1) // 2
     with styled():
-        fig = figure(3.4 * rows)
-        panels = np.ravel(fig.subplots(rows, min(2, len(groups)), squeeze=False))
-        for panel, ((scene, name), part) in zip(panels, groups, strict=False):
+        fig, drawn = panels(len(groups), 3.4, 2)
+        for panel, ((scene, name), part) in zip(drawn, groups, strict=True):
             for holds, trials in part.groupby("inside_90", sort=False):
                 bars = [trials["estimate"] - trials["lower"], trials["upper"] - trials["estimate"]]
                 panel.errorbar(
@@ -43,8 +41,6 @@ def trials_chart(table: pd.DataFrame, units: Mapping[tuple[str, str], str]) -> F
             low, high = panel.get_ylim()
             panel.set_ylim(low, high + 0.22 * (high - low))  # room for the legend
             panel.legend(fontsize=8, loc="upper left")
-        for panel in panels[len(groups) :]:
-            panel.set_visible(False)
     return fig
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from nsf import words
 from nsf.data import PROGRAM
 from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation.quantities import QUANTITIES
@@ -15,71 +16,46 @@ from nsf.paths import reports_folder
 from nsf.results.folder import check_place
 from nsf.runs import Run
 
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})")
+_RANGE = re.compile(rf"({words.NUMBER})\.\.({words.NUMBER})")
 _MOST_TRIALS = 10_000
-
-
-def _whole(least: int = 1, most: int = 10_000_000) -> Callable[[str, str], int]:
-    def read(key: str, text: str) -> int:
-        if not (re.fullmatch(r"\d{1,9}", text) and least <= int(text) <= most):
-            raise ConfigError(f"{key}={text} must be a whole number from {least} to {most}")
-        return int(text)
-
-    return read
 
 
 def _base(key: str, text: str) -> int:
     """A power of two, or 0."""
-    base = _whole(0)(key, text)
+    base = words.whole(0)(key, text)
     if base == 1 or base & (base - 1):
         raise ConfigError(f"{key}={base} must be a power of two of at least 2, as 32 or 1024")
     return base
 
 
-def _flag(key: str, text: str) -> bool:
-    if text not in ("true", "false"):
-        raise ConfigError(f"{key}={text} must be true or false")
-    return text == "true"
-
-
-def _number(key: str, text: str) -> float:
-    if not re.fullmatch(_NUMBER, text):
-        raise ConfigError(f"{key}={text} is no number")
-    return float(text)
-
-
-def _text(key: str, text: str) -> str:
-    return text
-
-
-_KEYS: dict[str, dict[str, Callable]] = {
+_SHARED = dict.fromkeys(("run", "+experiment", "device", "folder"), words.text) | {"seed": words.whole(0)}
+_KEYS: dict[str, dict[str, words.Reader]] = {
     "calibrate": {
-        "observations": _text, "trials": _whole(most=_MOST_TRIALS), "starts": _whole(), "full_order": _flag,
-        "program": _whole(0),
+        "observations": words.text, "trials": words.whole(most=_MOST_TRIALS), "starts": words.whole(),
+        "full_order": words.flag, "program": words.whole(0),
     },
     "sample": {
-        "of": _text, "runs": _whole(), "observations": _text, "sensitivities": _base, "full_order": _base,
-        "program": _whole(0),
+        "of": words.text, "runs": words.whole(), "observations": words.text, "sensitivities": _base,
+        "full_order": _base, "program": words.whole(0),
     },
     "design": {
-        "target": _text, "tilt": _number, "move": _text, "knots": _whole(most=1000), "full_order": _flag,
+        "target": words.text, "tilt": words.number, "move": words.text, "knots": words.whole(most=1000),
+        "full_order": words.flag,
     },
 }  # fmt: skip
-_EVERY = dict.fromkeys(("run", "+experiment", "device", "folder"), _text) | {"seed": _whole(0)}
 
 
-def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
+def calibrate(arguments: Sequence[str], say: Callable[[str], object] = print) -> Path:
     """Parameters from observations, or synthetic trials; gives the page.
 
     Args:
-        words: `key=value`, as `nsf calibrate --help` has them.
-        say: told what is done.
+        arguments: `key=value`, as `nsf calibrate --help` has them.
+        say: shows a line of progress.
 
     Raises:
         NSFError: a word is refused, a run is missing, or the observations do not tell.
     """
-    call = Words.of("calibrate", words)
+    call = Call.of("calibrate", arguments)
     values, named = call.values, call.named
     if ("trials" in values) == ("observations" in values):
         raise ConfigError(
@@ -105,17 +81,17 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
     return _written(calibration(problem, view, space, **options, say=say), folder, "calibrate", say)
 
 
-def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
+def sample(arguments: Sequence[str], say: Callable[[str], object] = print) -> Path:
     """Runs at drawn parameters; gives the page.
 
     Args:
-        words: `key=value`, as `nsf sample --help` has them.
-        say: told what is done.
+        arguments: `key=value`, as `nsf sample --help` has them.
+        say: shows a line of progress.
 
     Raises:
         NSFError: a word is refused, or a run or an extra is missing.
     """
-    call = Words.of("sample", words)
+    call = Call.of("sample", arguments)
     from nsf.extras import optional
     from nsf.inverse.reports.page import Problem
     from nsf.inverse.reports.sample import sampling
@@ -142,18 +118,18 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     return _written(results, folder, "sample", say)
 
 
-def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
+def design(arguments: Sequence[str], say: Callable[[str], object] = print) -> Path:
     """A program of forcing that brings a target about; gives the page.
 
     Args:
-        words: `key=value`, as `nsf design --help` has them.
-        say: told what is done.
+        arguments: `key=value`, as `nsf design --help` has them.
+        say: shows a line of progress.
 
     Raises:
         NSFError: a word is refused, or a run is missing.
     """
-    scalars = [key for word in words if is_scalar(key := word.split("=")[0])]
-    call = Words.of("design", words, dict.fromkeys(scalars, _number))
+    scalars = [key for word in arguments if is_scalar(key := word.split("=")[0])]
+    call = Call.of("design", arguments, dict.fromkeys(scalars, words.number))
     from nsf.inverse.design import Moves, Tilt
     from nsf.inverse.reports.design import designing
 
@@ -192,7 +168,7 @@ def ranges_of(named: dict[str, str]) -> dict[str, list[float] | float]:
     for name, text in named.items():
         if ends := _RANGE.fullmatch(text):
             ranges[name] = [float(ends[1]), float(ends[2])]
-        elif re.fullmatch(_NUMBER, text):
+        elif re.fullmatch(words.NUMBER, text):
             ranges[name] = float(text)
         else:
             raise ConfigError(f"{name}={text} is neither a value nor a range; give it as 30 or 25..35")
@@ -209,12 +185,12 @@ def _written(results, folder: Path, command: str, say: Callable[[str], object]) 
 
 
 @dataclass(frozen=True)
-class Words:
-    """The words of a command.
+class Call:
+    """A command with its words.
 
     Attributes:
         models: of the runs that are meant.
-        values: of the command's keys, read; named: texts by names of parameters.
+        values: of the command's keys; named: texts by names of parameters.
     """
 
     models: list[Model]
@@ -222,27 +198,24 @@ class Words:
     named: dict[str, str]
 
     @classmethod
-    def of(cls, command: str, words: Sequence[str], more: dict[str, Callable] | None = None) -> "Words":
-        """From `key=value`, with how to read keys that this command has today.
+    def of(
+        cls, command: str, arguments: Sequence[str], more: dict[str, words.Reader] | None = None
+    ) -> "Call":
+        """From `key=value`, with readers of further keys.
 
         Raises:
             ConfigError: a word is no such pair, or given twice, or its key unknown, or its value refused.
         """
-        if wrong := [word for word in words if "=" not in word]:
-            raise ConfigError(f"{wrong[0]!r} is not key=value; see `nsf {command} --help`")
-        keys = [word.split("=", 1)[0] for word in words]
-        if twice := [key for key in keys if keys.count(key) > 1]:
-            raise ConfigError(f"{twice[0]}= is given twice; give it once")
-        read = _EVERY | _KEYS[command] | (more or {})
-        texts = dict(word.split("=", 1) for word in words)
-        values = {key: read[key](key, text) for key, text in texts.items() if key in read}
+        readers = _SHARED | _KEYS[command] | (more or {})
+        texts = words.pairs(command, arguments)
+        values = {key: readers[key](key, text) for key, text in texts.items() if key in readers}
         runs = _runs(values.get("run"), values.get("+experiment"))
         models = [Model(run, values.get("device", "auto")) for run in runs]
-        named = {key: text for key, text in texts.items() if key not in read}
+        named = {key: text for key, text in texts.items() if key not in readers}
         names = sorted({name for model in models for name in model.names})
         if unknown := [key for key in named if key not in names]:
             raise ConfigError(
-                f"nsf {command} has no key {unknown[0]!r}; it takes {', '.join(sorted(read))}, and the "
+                f"nsf {command} has no key {unknown[0]!r}; it takes {', '.join(sorted(readers))}, and the "
                 f"parameters {', '.join(names)}"
             )
         return cls(models, values, named)

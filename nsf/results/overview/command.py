@@ -1,22 +1,31 @@
 """`nsf runs`: runs listed, shown, compared, verified and deleted."""
 
+import csv
+import json
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+from nsf import words
 from nsf.errors import ConfigError, StorageError
 from nsf.runs import Run
+from nsf.runs.columns import records
 from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.runs.pruning import bytes_text, dependents, older, prunable, remove, size_of
+from nsf.terminal import console
 
+_UNCUT = 10_000  # characters of a line that no terminal shows
 USAGE = f"""\
-usage: nsf runs [key=value[,value…] …] [sort=[-]key]
+usage: nsf runs [key=value[,value…] …] [sort=[-]key] [--json|--csv]
        nsf runs show ID
        nsf runs diff ID ID
        nsf runs verify [key=value …]
        nsf runs rm ID … [yes=true]
        nsf runs prune [key=value …] [older=AGE] [results=true] [yes=true]
 
-Every run there is, newest first, with a column for each key in which the runs shown differ.
+Every run there is, newest first, with a column for each key in which the runs shown differ, as far as
+the terminal is wide. --json and --csv print all of it, numbers unrounded, for other programs.
 
 keys:
   a field      {", ".join(FIELDS[:-1])}
@@ -42,50 +51,57 @@ examples:
   nsf runs prune scene=cake older=2w"""
 
 
-def main(words: Sequence[str], print_table: Callable[[object], object]) -> int:
+def main(arguments: Sequence[str]) -> int:
     """`nsf runs`; gives the exit code.
 
     Args:
-        words: of the command line.
-        print_table: shows a rich table.
+        arguments: of the command line.
 
     Raises:
         NSFError: a word, key or id is refused.
     """
-    words = list(words)
-    if {"-h", "--help"} & set(words):
+    arguments = list(arguments)
+    if {"-h", "--help"} & set(arguments):
         print(USAGE)
         return 0
-    from nsf.results.overview.tables import difference_table, run_table, runs_table  # rich takes 0.1 s
+    tools = {"show": _show, "diff": _diff, "verify": _verify, "rm": _remove, "prune": _prune}
+    if arguments and arguments[0] in tools:
+        return tools[arguments[0]](arguments[1:])
+    formats = [word for word in arguments if word in ("--json", "--csv")]
+    filters = words.pairs("runs", [word for word in arguments if word not in formats])
+    sort = filters.pop("sort", "")
+    runs = _matching(filters, sort or "-created")
+    named = [*filters, *([sort.removeprefix("-")] if sort else [])]
+    if formats:
+        {"--json": _json, "--csv": _csv}[formats[-1]](records(runs, named))
+    else:
+        from nsf.results.overview.tables import runs_table  # rich takes 0.1 s
 
-    if words[:1] == ["show"]:
-        for run in _named("show", words[1:], 1):
-            print_table(run_table(run, Run.find()))
-        return 0
-    if words[:1] == ["diff"]:
-        print_table(difference_table(*_named("diff", words[1:], 2)))
-        return 0
-    if words[:1] == ["verify"]:
-        return _verify(words[1:])
-    if words[:1] == ["rm"]:
-        return _remove(words[1:])
-    if words[:1] == ["prune"]:
-        return _prune(words[1:])
-    filters = _filters(words)
-    sort = filters.pop("sort", "-created")
-    runs = _matching(filters, sort)
-    sorted_by = [sort.removeprefix("-")] if len(words) > len(filters) else []
-    print_table(runs_table(runs, [*filters, *sorted_by]))
+        screen = _screen()
+        screen.print(runs_table(runs, named, screen.width))
     _say(f"broken: {entry.run.path}: {entry.fault}" for entry in runs if entry.fault)
-    _say([f"{len(runs)} runs" + (", of which `nsf runs --help` says more" if not words else "")])
+    _say([f"{len(runs)} runs" + ("" if arguments else ", of which `nsf runs --help` says more")])
     return 0
 
 
-def _filters(words: Sequence[str]) -> dict[str, str]:
-    unknown = [word for word in words if word.startswith("-") or "=" not in word]
-    if unknown:
-        raise ConfigError(f"{unknown[0]!r} is not key=value; see `nsf runs --help`")
-    return dict(word.split("=", 1) for word in words)
+def _screen():
+    """A console as wide as the terminal, or as COLUMNS says; as wide as need be where there is neither."""
+    wide = sys.stdout.isatty() or "COLUMNS" in os.environ
+    return console(sys.stdout, None if wide else _UNCUT)
+
+
+def _json(rows: Sequence[Mapping[str, Any]]) -> None:
+    print(json.dumps(rows, indent=1, ensure_ascii=False, default=str))
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> None:
+    from nsf.results.formats import spreadsheet  # templates take 0.1 s
+
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(sys.stdout, list(names), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: spreadsheet(value) for name, value in row.items()})
 
 
 def _matching(filters: dict[str, str], sort: str = "-created") -> list[Entry]:
@@ -99,25 +115,39 @@ def _matching(filters: dict[str, str], sort: str = "-created") -> list[Entry]:
         raise
 
 
-def _named(command: str, words: Sequence[str], count: int) -> list[Run]:
-    if len(words) != count:
+def _named(command: str, ids: Sequence[str], count: int) -> list[Run]:
+    if len(ids) != count:
         wanted = "two runs" if count == 2 else "one run"
-        raise ConfigError(f"nsf runs {command} takes {wanted}, not {len(words)}; `nsf runs` lists them")
-    return list(map(Run.named, words))
+        raise ConfigError(f"nsf runs {command} takes {wanted}, not {len(ids)}; `nsf runs` lists them")
+    return list(map(Run.named, ids))
 
 
-def _verify(words: Sequence[str]) -> int:
-    filters = _filters(words)
-    runs = _matching(filters, filters.pop("sort", "-created"))
+def _show(ids: Sequence[str]) -> int:
+    from nsf.results.overview.tables import run_table
+
+    (run,) = _named("show", ids, 1)
+    _screen().print(run_table(run, Run.find()))
+    return 0
+
+
+def _diff(ids: Sequence[str]) -> int:
+    from nsf.results.overview.tables import difference_table
+
+    _screen().print(difference_table(*_named("diff", ids, 2)))
+    return 0
+
+
+def _verify(arguments: Sequence[str]) -> int:
+    runs = _matching(words.pairs("runs verify", arguments))
     faults = [fault for entry in runs for fault in entry.run.verify()]
     _say(faults)
     _say([f"{len(runs)} runs, {len(faults)} faults"])
     return 2 if faults else 0
 
 
-def _remove(words: Sequence[str]) -> int:
-    ids = [word for word in words if "=" not in word]
-    sure = _is_sure(_filters([word for word in words if "=" in word]), "rm")
+def _remove(arguments: Sequence[str]) -> int:
+    ids = [word for word in arguments if "=" not in word]
+    options = words.values("runs rm", [word for word in arguments if "=" in word], {"yes": words.flag})
     if not ids:
         raise ConfigError("nsf runs rm takes the runs that are to go; `nsf runs` lists them")
     going = list(dict.fromkeys(map(Run.named, ids)))
@@ -126,28 +156,17 @@ def _remove(words: Sequence[str]) -> int:
         if needed := sorted(one.id for one in of.get(run, set()).difference(going)):
             more = f" and {len(needed) - 1} more" if len(needed) > 1 else ""
             _say([f"{needed[0]}{more} was made from {run.id}, and cannot be made again without it"])
-    return _delete(going, sure)
+    return _delete(going, options.get("yes", False))
 
 
-def _prune(words: Sequence[str]) -> int:
-    filters = _filters(words)
-    sure = _is_sure(filters, "prune", ("results",))
-    results = filters.pop("results", "false") == "true"
+def _prune(arguments: Sequence[str]) -> int:
+    filters = words.pairs("runs prune", arguments)
+    sure, results = (words.flag(key, filters.pop(key, "false")) for key in ("yes", "results"))
     age = filters.pop("older", None)
-    filters.pop("yes", None)
     runs = _matching(filters)
     if age is not None:
         runs = older(runs, age)
     return _delete(prunable(runs, Run.find(), results), sure)
-
-
-def _is_sure(filters: dict[str, str], command: str, more: Sequence[str] = ()) -> bool:
-    for key in ("yes", *more):
-        if filters.get(key, "true") not in ("true", "false"):
-            raise ConfigError(f"{key}={filters[key]} must be true or false")
-    if command == "rm" and (unknown := [key for key in filters if key != "yes"]):
-        raise ConfigError(f"nsf runs rm has no key {unknown[0]!r}; it takes yes=")
-    return filters.get("yes") == "true"
 
 
 def _delete(going: Sequence[Run], sure: bool) -> int:

@@ -13,10 +13,9 @@ from nsf.data import Trajectory, archives
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
 from nsf.results.formats import HTML
-from nsf.results.overview.tables import cells, headings
+from nsf.results.overview.tables import Column, columns
 from nsf.results.style import FULL, PALETTE, REDUCED, figure, styled
 from nsf.runs import Run
-from nsf.runs.columns import differing
 from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.storage import writing
 
@@ -40,7 +39,7 @@ def write_index(folder: Path, root: Path | None = None) -> Path:
         StorageError: the disk refused a file.
     """
     runs = entries(root=root)
-    keys = differing(runs).keys
+    shown, _ = columns(runs)
     choices = [
         {
             "name": field,
@@ -52,25 +51,25 @@ def write_index(folder: Path, root: Path | None = None) -> Path:
     page = HTML.get_template("runs.html").render(
         title="Runs",
         choices=choices,
-        headings=headings(keys),
-        rows=[_row(entry, keys, folder) for entry in runs],
+        headings=[column.title for column in shown],
+        rows=[_row(entry, shown, folder) for entry in runs],
     )
     with writing(folder / "index.html") as partial:
         partial.write_text(page, encoding="utf-8")
     return folder / "index.html"
 
 
-def _row(entry: Entry, keys: Sequence[str], folder: Path) -> dict:
+def _row(entry: Entry, shown: Sequence[Column], folder: Path) -> dict:
     """A row of the page: its cells as shown, and the values by which they sort."""
     picture = f"thumbnails/{entry.run.id}.png"
-    row = zip([*FIELDS, *keys], cells(entry, keys), strict=True)
     return {
         "picture": picture if thumbnail(entry.run, folder / picture) else None,
         "link": Path(os.path.relpath(entry.run.path / "manifest.json", folder)).as_posix(),
         "error": text(entry.fault or entry.manifest.get("error") or ""),
         "cells": [
-            {"name": name, "text": cell.text, "value": "" if cell.value is None else cell.value}
-            for name, cell in row
+            {"name": column.key, "text": column.text(entry), "value": "" if value is None else value}
+            for column in shown
+            for value in [column.value(entry)]
         ],
     }
 

@@ -5,62 +5,120 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
 from nsf.errors import SchemaError
-from nsf.results.columns import number
+from nsf.results.columns import brief, number
 from nsf.runs import Run
-from nsf.runs.columns import cell, differing, scaled, title_of, unit_of
-from nsf.runs.listing import FIELDS, MAIN, ORIGIN, Entry, flat, text, value_of
+from nsf.runs.columns import CASE, TITLES, differing, scaled, setting, title_of, unit_of
+from nsf.runs.listing import FIELDS, MAIN, ORIGIN, Entry, flat, text
 from nsf.runs.pruning import bytes_text, size_of
 
-#: Characters that a terminal, however narrow, leaves of a field.
-_WIDTHS = {"stage": 8, "id": 12}
+_MOST = 6  # keys that have a column, beside those of `TITLES` and those that are named
+_WIDEST = 28  # characters of a cell
+_GAP = 2  # characters between columns
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A value of a listed run: its text, and the value by which it sorts."""
+class Column:
+    """A field of listed runs, or a key."""
 
-    text: str
-    value: Any
+    key: str
+
+    @property
+    def title(self) -> str:
+        """Its heading, with the unit."""
+        return "time [s]" if self.key == "seconds" else title_of(self.key)
+
+    @property
+    def numeric(self) -> bool:
+        """Whether it is aligned to the right."""
+        return self.key == "seconds"
+
+    def value(self, entry: Entry) -> Any:
+        """The value of a run, by which it sorts."""
+        return setting(entry, self.key)
+
+    def text(self, entry: Entry) -> str:
+        """The value as shown."""
+        value = self.value(entry)
+        if self.key == "created":
+            return _when(value) if value else text(value)
+        if self.key == "metric":
+            return _metric(entry)
+        shown = brief(_rounded(self.key, value) if self.key in entry.values else text(value))
+        return shown if self.key == CASE or len(shown) <= _WIDEST else f"{shown[: _WIDEST - 1]}…"
 
 
-def headings(keys: Sequence[str]) -> list[str]:
-    """Of the fields of a run, and of keys."""
-    return ["time [s]" if field == "seconds" else field for field in FIELDS] + list(map(title_of, keys))
+def columns(listed: Sequence[Entry], named: Sequence[str] = ()) -> tuple[list[Column], list[str]]:
+    """The fields of runs, and keys in which they differ or that are named; further keys that differ."""
+    keys = differing(listed, named)
+    more = [key for key in keys if key not in TITLES and key not in named][_MOST:]
+    return [Column(key) for key in (*FIELDS, *keys) if key not in more], more
 
 
-def cells(entry: Entry, keys: Sequence[str]) -> list[Cell]:
-    """A run below `headings`."""
-    shown = {field: text(entry.values[field]) for field in FIELDS}
-    if entry.values["created"]:
-        shown["created"] = _when(entry.values["created"])
-    shown["seconds"] = number(entry.values["seconds"])
-    if isinstance(entry.values["metric"], int | float):
-        _, title = MAIN[entry.run.stage]
-        percent = title == "δ"
-        shown["metric"] = f"{title} {number(entry.values['metric'], 100 if percent else 1)}" + " %" * percent
-    elif entry.metrics.get("diverged"):
-        shown["metric"] = "diverged"
-    fields = [Cell(shown[field], entry.values[field]) for field in FIELDS]
-    return fields + [Cell(_setting(entry, key), value_of(entry, key)) for key in keys]
+def runs_table(listed: Sequence[Entry], named: Sequence[str] = (), width: int = 160) -> Group:
+    """Runs with as many columns as a terminal of some width has room for; no cell is cut.
 
+    Below stand the values that all runs share, cases of several parameters by their number, and the keys
+    without a column.
 
-def runs_table(runs: Sequence[Entry], named: Sequence[str] = ()) -> Table:
-    """Runs, with a column for each key in which they differ, or that was filtered or sorted by."""
-    keys = differing(runs, named)
+    Args:
+        listed: the runs.
+        named: keys that were filtered or sorted by, which have a column.
+        width: [characters].
+    """
+    every, more = columns(listed, named)
+    texts = {column: [column.text(entry) for entry in listed] for column in every}
+    keys = {key for key in named if key not in FIELDS}
+    shared = [c for c in every if len(listed) > 1 and len(set(texts[c])) == 1 and c.key not in keys]
+    legend = _numbered(texts)
+    widths = {column: max(map(len, (column.title, *cells))) for column, cells in texts.items()}
+    shown, room = [], width + _GAP
+    for column in sorted((c for c in every if c not in shared), key=lambda c: _rank(c.key, named)):
+        if widths[column] + _GAP <= room:
+            shown.append(column)
+            room -= widths[column] + _GAP
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for heading in headings(keys.keys):
-        justify = "right" if heading == "time [s]" else "left"
-        table.add_column(escape(heading), justify=justify, no_wrap=True, min_width=_WIDTHS.get(heading))
-    for entry in runs:
-        table.add_row(*(escape(cell.text) for cell in cells(entry, keys.keys)))
-    if keys.more:
-        table.caption = f"These differ as well, and have a column with KEY=*: {', '.join(keys.more)}"
-        table.caption_justify = "left"
-    return table
+    for column in (chosen := [column for column in every if column in shown]):
+        table.add_column(escape(column.title), justify="right" if column.numeric else "left", no_wrap=True)
+    for row in zip(*(texts[column] for column in chosen), strict=True):
+        table.add_row(*map(escape, row))
+    said = [f"{column.title} {texts[column][0]}" for column in shared if texts[column][0] != text(None)]
+    narrow = [column.title for column in every if column not in shown and column not in shared]
+    lines = [
+        f"The same in all: {', '.join(said)}" if said else "",
+        *(f"case {k}: {case}" for case, k in legend.items()),
+        f"Hidden for want of width: {', '.join(narrow)}" if narrow else "",
+        f"These differ as well, and have a column with KEY=*: {', '.join(more)}" if more else "",
+    ]
+    return Group(table, *map(escape, filter(None, lines)))
+
+
+def _numbered(texts: dict[Column, list[str]]) -> dict[str, str]:
+    """Put numbers in place of cases of several values, which are long; gives the number of each case."""
+    cases = texts.get(Column(CASE), [])
+    if not any("," in case or ";" in case for case in cases):
+        return {}
+    legend = {case: str(k) for k, case in enumerate(dict.fromkeys(cases), 1)}
+    texts[Column(CASE)] = [legend[case] for case in cases]
+    return legend
+
+
+def _rank(key: str, named: Sequence[str]) -> int:
+    """The order in which columns take the room that there is."""
+    order = ("id", "metric", "", "status", "scene", "stage", "seconds", "created")
+    return 1 if key in named else order.index(key if key in order else "")
+
+
+def _metric(entry: Entry) -> str:
+    value = entry.values["metric"]
+    if not isinstance(value, int | float):
+        return "diverged" if entry.metrics.get("diverged") else text(value)
+    _, title = MAIN[entry.run.stage]
+    return f"{title} {number(value, 100)} %" if title == "δ" else f"{title} {number(value)}"
 
 
 def run_table(run: Run, everything: Sequence[Run]) -> Table:
@@ -145,11 +203,6 @@ def _both(key: str, a: Any, b: Any) -> tuple[str, str]:
 
 def _rounded(key: str, value: Any) -> str:
     return number(scaled(key, value)) if isinstance(value, float) else text(scaled(key, value))
-
-
-def _setting(entry: Entry, key: str) -> str:
-    value = entry.values.get(key)
-    return _rounded(key, value) if isinstance(value, float) else cell(entry, key)
 
 
 def _with_unit(key: str, value: Any) -> str:

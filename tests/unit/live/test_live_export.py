@@ -136,8 +136,6 @@ def test_a_model_is_there_at_once(capsys, tmp_path, monkeypatch):
         ConfigError, match="model=cake is none that is shipped; choose one of block, sand, metal"
     ):
         demo.show("cake", tmp_path)
-    with pytest.raises(ConfigError, match="open=no must be true or false"):
-        demo.show(None, tmp_path, "no")
     with pytest.raises(SystemExit) as end:
         main(["demo", "model=sand", f"folder={tmp_path}", "open=false"])
     assert not end.value.code

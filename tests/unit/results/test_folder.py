@@ -72,18 +72,14 @@ def test_a_report_of_a_fresh_clone_is_replaced(report):
     assert (report / "thesis.tex").exists()
 
 
-def test_names_like_those_of_killed_processes_are_left_alone(report):
-    """A folder beside a report, as an editor or a person names it, is not removed or renamed."""
-    others = [
-        report.parent / name for name in (".thesis.old-20260101", ".draft.new-abcdefgh", ".heap.old-v1")
-    ]
-    for other in others:
-        other.mkdir()
-        (other / "work").touch()
-    rewrite(report)
-    (report.parent / ".thesis.lock").touch()
-    rewrite(report)
-    assert all((other / "work").exists() for other in others)
+def test_what_a_killed_process_left_is_put_back(report):
+    work = report.with_name(".heap.partial")
+    (work / "new").mkdir(parents=True)
+    report.rename(work / "old")
+    with pytest.raises(KeyboardInterrupt), replaced(report):
+        raise KeyboardInterrupt
+    assert (report / "index.md").read_text() == "a page"
+    assert not work.exists()
 
 
 def test_an_experiment_from_elsewhere_writes_no_report_outside(tmp_path, monkeypatch):
