@@ -282,6 +282,7 @@ def _stages(stage: str) -> tuple[str, ...]:
 def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]) -> int:
     """A stage, or the whole chain, of an experiment's jobs, and its report; 2 if something is missing."""
     from nsf.pipeline.experiment import Experiment
+    from nsf.progress import timed
 
     if stage == "point":
         raise ConfigError("experiments have no material points; leave +experiment out")
@@ -292,7 +293,8 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
     if stage != "report":
         code = _sweep(stage, experiment.sweeps, launcher, experiment.stages if stage == "run" else ())
     if stage in ("run", "report"):
-        page, missing = experiment.report()
+        with timed("report"):
+            page, missing = experiment.report()
         _show(page, table=stage == "report" or len(experiment.jobs) == 1)
         for told in missing:
             print(f"missing: {told}", file=sys.stderr)
@@ -335,7 +337,10 @@ def _show(page, table: bool = True) -> None:
         from nsf.results.table import console_table
 
         _console().print(console_table(page.parent / "results.csv"))
+    from nsf.progress import slowest_stage
+
     print(f"open {page.resolve()}")
+    print(slowest_stage())
 
 
 def _console():

@@ -9,7 +9,7 @@ from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.engines.base import Engine
-    from nsf.engines.building import reduced, reduced_batch
+    from nsf.engines.building import moves_particles, reduced, reduced_batch
     from nsf.engines.choice import ENGINES, NAMES, choose
     from nsf.engines.modal import Modal
     from nsf.engines.reference import Reference
@@ -21,6 +21,7 @@ __all__ = [
     "Modal",
     "Reference",
     "choose",
+    "moves_particles",
     "reduced",
     "reduced_batch",
 ]

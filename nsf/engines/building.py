@@ -99,12 +99,14 @@ def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, op
         samples = list(sample)
     else:
         samples = [SampleSpan(0.0, _indices(sample, len(manifold.X)))]
+    if not moves_particles(engine) and not options.get("sets"):  # nothing is moved but the latent vector
+        options = options | {"sets": [ParticleSets(s.particles, s.particles, None) for s in samples]}
     return Setup(manifold, scene, samples, parameters, **options)
 
 
 def _sampled(scene, manifold, sampler: Sampler, engine: str | Engine, options: dict) -> list[SampleSpan]:
     """The sample of a sampler; one that learns from steps gets solvers whose sample is every particle."""
-    if isinstance(engine, Engine) and not engine.moves_particles:
+    if not moves_particles(engine):
         engine = "auto"
     everyone = np.arange(len(manifold.X))
     options_of_all = {"sample": everyone, "sets": [ParticleSets(everyone, everyone, None)], "engine": engine}
@@ -113,6 +115,11 @@ def _sampled(scene, manifold, sampler: Sampler, engine: str | Engine, options: d
     return sampler.spans_of(
         manifold, device, lambda parameters: reduced(scene, manifold, parameters, **options_of_all)
     )
+
+
+def moves_particles(engine: str | Engine) -> bool:
+    """Whether the steps of an engine move particles, and not latent vectors alone."""
+    return isinstance(engine, str) or engine.moves_particles
 
 
 def _indices(sample, particles: int) -> np.ndarray:

@@ -400,7 +400,7 @@ class Pipeline(Configured):
 
         By the configured model, of the scene that is deployed, unless an engine or a scene is given.
         """
-        from nsf.engines import reduced_batch
+        from nsf.engines import moves_particles, reduced_batch
 
         if engine is None:
             engine = self.model.engine(self, manifold)
@@ -417,9 +417,11 @@ class Pipeline(Configured):
             device=device or self.device,
             dt_multiplier=self.config.deploy.dt_multiplier,
             # As the sample, these depend on the manifold and the sampler alone: found once for all cases.
-            sets=self._sets,
+            sets=self._sets if moves_particles(engine) else None,
         )
-        self._samples, self._sets = batch.batch.shared.samples, batch.batch.shared.sets
+        self._samples = batch.batch.shared.samples
+        if moves_particles(engine):
+            self._sets = batch.batch.shared.sets
         return batch
 
     def recurrence(self) -> "RecurrenceEngine":

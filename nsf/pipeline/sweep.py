@@ -23,7 +23,7 @@ from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
 from nsf.gpu import has_driver
 from nsf.pipeline.chain import Pipeline
-from nsf.progress import label, labelled
+from nsf.progress import label, labelled, timed
 from nsf.runs import Run
 from nsf.runs.reserved import reserved, reserving
 from nsf.terminal import guard
@@ -62,7 +62,8 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     needs_others = len(stages) > 1 and not pipeline.complete(stages)
     with reserving(pipeline.inputs if needs_others else ()):
         for at, name in enumerate(stages):
-            result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
+            with timed(name):
+                result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
     return result
 
 
@@ -160,7 +161,8 @@ def reports(overrides: Sequence[str], say: Callable[[str], object] = print) -> l
     Raises:
         MissingRunError: no job of a scene was evaluated.
     """
-    return [pipeline.report() for pipeline in _reporting(overrides, say)]
+    with timed("report"):
+        return [pipeline.report() for pipeline in _reporting(overrides, say)]
 
 
 def check_report_folders(overrides: Sequence[str]) -> None:

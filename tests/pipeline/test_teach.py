@@ -12,7 +12,9 @@ from angles import angle
 
 import nsf
 from nsf.deployment import LATENT_MODEL, PROJECTED, Fallback, Rollout, rollouts
+from nsf.dynamics.integration import NeighbourSearch
 from nsf.errors import ConfigError, InstabilityError, MissingRunError
+from nsf.pipeline import Pipeline
 from nsf.pipeline.stages import encoding
 from nsf.recurrence import RecurrenceEngine
 
@@ -209,6 +211,14 @@ def test_a_run_is_a_solver_as_others(reduced, lesson):
     kept = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
     np.testing.assert_array_equal(kept.xhat, first.numpy())
     np.testing.assert_array_equal(kept.stress, solver.record.stress.numpy())
+
+
+def test_a_run_searches_no_particles_that_it_does_not_move(lesson, monkeypatch):
+    pipeline, _ = lesson
+    monkeypatch.setattr(NeighbourSearch, "superset", None)
+    fresh = Pipeline(pipeline.config, say=lambda line: None, root=pipeline.root)
+    solver = fresh.solver_at(pipeline.manifold(), angle(26.0))
+    np.testing.assert_array_equal(solver.sets[0].integration, solver.sets[0].sample)
 
 
 def test_stress_is_decoded_from_its_coordinates(reduced):
