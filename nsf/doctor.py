@@ -32,9 +32,9 @@ def _lines(find: Callable[[], Iterator[str]]) -> list[str]:
 
 
 def _versions() -> Iterator[str]:
-    found = provenance()
-    commit = str(found["commit"] or "unknown")[:12] + (", changed" if found["dirty"] else "")
-    for name, version in found["versions"].items():
+    made_with = provenance()
+    commit = str(made_with["commit"] or "unknown")[:12] + (", changed" if made_with["dirty"] else "")
+    for name, version in made_with["versions"].items():
         yield f"{name:<10} {version or 'missing'}" + (f" (commit {commit})" if name == "nsf" else "")
     yield f"{'system':<10} {platform.platform()}"
 
@@ -65,10 +65,10 @@ def _dotted(version: Sequence[int]) -> str:
 def _kernel_module() -> str:
     """Version of the NVIDIA driver, where Linux tells it."""
     try:
-        found = re.search(r"\d+\.\d+\.\d+", Path("/proc/driver/nvidia/version").read_text())
+        version = re.search(r"\d+\.\d+\.\d+", Path("/proc/driver/nvidia/version").read_text())
     except OSError:
         return ""
-    return f"{found[0]}, " if found else ""
+    return f"{version[0]}, " if version else ""
 
 
 def _folders() -> Iterator[str]:
@@ -104,8 +104,8 @@ def _extras() -> Iterator[str]:
     for extra in extras:
         if extra in _DEVELOPMENT:
             continue
-        own = [r for r in required if r.marker and r.marker.evaluate({"extra": extra})]
-        missing = [r.name for r in own if not _fits(r)]
+        needed = [r for r in required if r.marker and r.marker.evaluate({"extra": extra})]
+        missing = [r.name for r in needed if not _fits(r)]
         state = f"missing {', '.join(missing)}: pip install 'nsf[{extra}]'" if missing else "there"
         yield f"{extra:<10} {state}"
 

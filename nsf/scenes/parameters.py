@@ -90,9 +90,9 @@ def _check_key(scene: Any, where: str, parameter: Parameter) -> None:
     try:
         configured = value_at(scene, parameter.path)
     except KeyError as error:
-        part, there = error.args
+        part, names = error.args
         raise ConfigError(
-            f"{where}={key!r}: there is no {part!r}, but {', '.join(there) or 'nothing'}; {remedy}"
+            f"{where}={key!r}: there is no {part!r}, but {', '.join(names) or 'nothing'}; {remedy}"
         ) from error
     if not is_finite(configured):
         raise ConfigError(f"{where}={key!r} names no key that holds a number; {remedy}")

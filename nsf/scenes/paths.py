@@ -31,7 +31,7 @@ def value_at(node: Any, parts: Sequence[str]) -> Any:
 def _inside(node: Any) -> dict[str, Any]:
     """What a dataclass, a mapping or a list holds, by the part of a path that leads there."""
     if is_dataclass(node):
-        return {own.name: getattr(node, own.name) for own in fields(node)}
+        return {field.name: getattr(node, field.name) for field in fields(node)}
     if isinstance(node, Mapping):
         return dict(node)
     return {str(at): inner for at, inner in enumerate(node)} if is_list(node) else {}
@@ -62,5 +62,5 @@ def with_value(node: Any, parts: Sequence[str], value: Any, where: str) -> Any:
     try:
         return replace(node, **{first: inner})
     except NSFError as error:
-        told = str(error)
-        raise type(error)(told if told.startswith(where) else f"{where}: {told}") from error
+        text = str(error)
+        raise type(error)(text if text.startswith(where) else f"{where}: {text}") from error

@@ -137,11 +137,11 @@ class RandomShake(GravityProgram):
 
     def of(self, gravity: Gravity, duration: float, generator: np.random.Generator) -> Gravity:
         """See `GravityProgram.of`."""
-        own, pushed = _wandering(duration, self.knots, generator)
-        times = np.union1d(own, gravity.times)
-        added = np.stack([np.interp(times, own, way) for way in self.acceleration * pushed.T], 1)
-        found = gravity.at(times) + added @ across(gravity.at(0.0))
-        return Gravity(times.tolist(), found.tolist())
+        shake_times, pushed = _wandering(duration, self.knots, generator)
+        times = np.union1d(shake_times, gravity.times)
+        added = np.stack([np.interp(times, shake_times, way) for way in self.acceleration * pushed.T], 1)
+        values = gravity.at(times) + added @ across(gravity.at(0.0))
+        return Gravity(times.tolist(), values.tolist())
 
     def reach(self, gravity: float) -> float:
         """See `GravityProgram.reach`."""
@@ -271,8 +271,8 @@ class Programs:
     def reach(self, gravity: Sequence[float]) -> float:
         """How far from the scene's gravity [3] any run's may be [m/s²]."""
         size, far = float(np.linalg.norm(gravity)), 0.0
-        for own in self.gravity.values():
-            far += own.reach(size + far)
+        for change in self.gravity.values():
+            far += change.reach(size + far)
         return far
 
     def check(self, names: Sequence[str], duration: float, dt: float, dx: float) -> None:
@@ -281,13 +281,13 @@ class Programs:
         Raises:
             ConfigError: names the program.
         """
-        for name, own in self.colliders.items():
+        for name, drive in self.colliders.items():
             where = f"scene.forcing.colliders.{name}"
             if name not in names:
                 raise ConfigError(
                     f"{where} moves a collider that does not exist; there are {', '.join(names) or 'none'}"
                 )
-            if (speed := own.top_speed(duration)) * dt > dx:
+            if (speed := drive.top_speed(duration)) * dt > dx:
                 raise ConfigError(
                     f"{where} may reach {speed:.3g} m/s, more than a cell, {dx:.3g} m, a step of {dt:g} s; "
                     "let it be slower, or choose a smaller scene.dt"

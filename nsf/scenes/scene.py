@@ -154,8 +154,8 @@ class Scene:
             ConfigError: a name is no parameter of the scene, or a value no finite number.
         """
         if values is None or isinstance(values, Mapping):
-            own = {name: value_at(self, parameter.path) for name, parameter in self.varied.items()}
-            values = own | dict(values or {})
+            scene_values = {name: value_at(self, parameter.path) for name, parameter in self.varied.items()}
+            values = scene_values | dict(values or {})
         if not isinstance(values, Mapping):
             values = np.atleast_1d(values).tolist()
             if self.forcing and len(values) == len(self.parameters):
@@ -187,7 +187,7 @@ class Scene:
         Raises:
             ConfigError: the scene has no such key, or a value is refused.
         """
-        found: dict[str, Any] = {}
+        changed: dict[str, Any] = {}
         for key, value in values.items():
             first, *rest = path = parts_of(key)
             try:
@@ -196,8 +196,8 @@ class Scene:
                 raise ConfigError(
                     f"scene {self.name} has no {key!r}: there is no {error.args[0]!r}"
                 ) from error
-            found[first] = with_value(found.get(first, getattr(self, first)), rest, value, first)
-        return replace(self, **found)
+            changed[first] = with_value(changed.get(first, getattr(self, first)), rest, value, first)
+        return replace(self, **changed)
 
     def refined(self, factor: int, substeps: int = 1) -> Self:
         """The same scene with factor times the particles on the same grid; a body's own come first in it.
