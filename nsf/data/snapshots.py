@@ -29,6 +29,11 @@ SLAB_ENTRIES = 2**26  # values of a slab: 0.5 GiB in float64
 Indices = slice | Sequence[int] | np.ndarray | Tensor
 
 
+def resident_bytes(frames: int, particles: int) -> int:
+    """[byte] of x, tau and C of some frames in float32."""
+    return 4 * frames * particles * sum(COMPONENTS[field] for field in RESIDENT_FIELDS)
+
+
 class Snapshots:
     """Rows of (frame, case), by trajectory and then by frame.
 
@@ -97,8 +102,8 @@ class Snapshots:
 
     @property
     def nbytes(self) -> int:
-        """[byte] of x, tau and C of all rows in float32."""
-        return 4 * self.M * self.P * sum(COMPONENTS[field] for field in RESIDENT_FIELDS)
+        """[byte] of x, tau and C of all rows."""
+        return resident_bytes(self.M, self.P)
 
     def slab(self, field: str, particles: Indices) -> Float[Tensor, "row particle component"]:
         """All frames of some particles.

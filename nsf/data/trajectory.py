@@ -14,7 +14,7 @@ import numpy as np
 from nsf.data import hdf5
 from nsf.data.schema import COMPONENTS, FORCING, SCHEMA_VERSION, TAU_ORDER, UNITS, hash_of_positions, packed
 from nsf.data.sink import Sink
-from nsf.errors import InstabilityError, SchemaError, ShapeError
+from nsf.errors import ConfigError, InstabilityError, SchemaError, ShapeError
 from nsf.storage import require_space, writing
 
 _EXACT, _STORED = ("<f8",), ("<f4", "<f8")  # types of constants and of frames
@@ -174,6 +174,7 @@ class Trajectory:
         x_sha256: identity of the particles (`hash_of_positions`).
         particles: P.
         frames: F, the initial frame included.
+        every: steps of the solver from a frame to the next.
     """
 
     def __init__(self, path: Path, file: h5py.File) -> None:
@@ -197,6 +198,7 @@ class Trajectory:
         self.t = hdf5.values(file, "frames/t", _EXACT, (None,), increasing=True)
         self.frames = len(self.t)
         self._check_spacing()
+        self.every = round((self.t[1] - self.t[0]) / self.dt) if self.frames > 1 else 1
         self._frames = {
             name: _mapped(path, hdf5.array(file, f"frames/{name}", _STORED, (self.frames, P, c)))
             for name, c in COMPONENTS.items()
@@ -274,6 +276,20 @@ class Trajectory:
                     out[i] = stored[row, columns]
         self._check_finite(field, numbers, out)
         return out
+
+    def frames_at(self, steps: np.ndarray) -> np.ndarray:
+        """Indices of the frames after some numbers of steps.
+
+        Raises:
+            ConfigError: one of them was not stored.
+        """
+        frames, beyond = np.divmod(steps, self.every)
+        if beyond.any():
+            raise ConfigError(
+                f"{self.path} stores each {self.every}th step, and step {steps[beyond > 0][0]} is needed; "
+                "simulate with data.every=1"
+            )
+        return frames
 
     def close(self) -> None:
         """Close the file; arrays already read stay valid."""

@@ -115,13 +115,19 @@ class Setup:
         latents = self.manifold.training_latents.to(self.torch_device, self.dtype)
         fraction = self.manifold.training_times.to(self.torch_device) / (self.scene.dt * self.scene.steps)
         ends = [sample.start for sample in self.samples[1:]] + [1.0]
-        slack = 2.0 / self.scene.steps  # a span also meets the frames just before and after it
+        # A span also meets the frames just before and after it.
+        slack = 2.0 * self._frame_every() / self.scene.steps
         sets = []
         for sample, end in zip(self.samples, ends, strict=True):
             of_span = latents[(fraction >= sample.start - slack) & (fraction <= end + slack)]
             frames = decoder.positions(of_span)
             sets.append(self.search.superset(frames, sample.particles, self.integration.margin))
         return sets
+
+    def _frame_every(self) -> int:
+        """Steps from a training frame to the next."""
+        between = torch.diff(self.manifold.training_times, prepend=self.manifold.training_times[:1]).amax()
+        return max(1, round(float(between) / self.scene.dt))
 
     def sources_at(self, at: Restriction, particles: np.ndarray) -> tuple[StressSource, AffineSource]:
         """The sources of τ and C at particles [n], to which the fields are restricted."""

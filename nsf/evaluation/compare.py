@@ -3,12 +3,14 @@
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
 
 from nsf.data import Trajectory
+from nsf.data.schema import COMPONENTS
 from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.dynamics.setup import Setup
@@ -137,10 +139,13 @@ def compare(
         # To the device before the wider type: half the bytes travel, and the device converts.
         return torch.as_tensor(np.asarray(values)).to(device).to(setup.dtype)
 
-    xhat, X, mass = tensor(xhat), tensor(trajectory.X), tensor(trajectory.mass)
-    stress = None if rollout.stress is None else tensor(_between(trajectory.t, rollout.t, rollout.stress))
-    rate = torch.diff(xhat, dim=0, prepend=xhat[:1]) / trajectory.dt
+    before = at_frames(rollout, trajectory.t - trajectory.dt)
+    before[~good] = xhat[~good]
+    xhat, before, X, mass = map(tensor, (xhat, before, trajectory.X, trajectory.mass))
+    rate = (xhat - before) / trajectory.dt
     rate[0] = solver.first_rate
+    stress = None if rollout.stress is None else tensor(_between(trajectory.t, rollout.t, rollout.stress))
+    latents = _Latents(xhat[:until], before[:until], rate[:until], stress, trajectory.dt)
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
     shown_frames = spaced(frames, pictures[1])
     samples = {n: _sample_at(solver, trajectory.t[n]) for n in shown_frames}
@@ -152,19 +157,15 @@ def compare(
         for name, value in values.items():
             rows.setdefault(name, []).append(value.cpu())
 
-    carried = _Carried(solver) if _carries(solver, rollout, trajectory) else None
-    previous = decoder.position(xhat[0])
+    carried = _Carried(solver, trajectory.every) if _carries(solver, rollout, trajectory) else None
     per_chunk = frames_at_once(_VALUES * trajectory.particles, setup.dtype, device)
     for start in range(0, frames, per_chunk):
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        latent = xhat[:until], rate[:until], stress
-        x_rom, C_rom, tau_rom = _reduced_fields(decoder, *latent, continuation, block, carried)
-        v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
+        x_rom, v_rom, C_rom, tau_rom = _reduced_fields(decoder, latents, continuation, block, carried)
         if start == 0:
             v_rom[0] = v[0]
-        previous = x_rom[-1]
         encoded = manifold.encode(x).to(setup.dtype)
         x_rec, tau_rec = decoder.position(encoded), decoder.at.stress(encoded, parameters)
         note(
@@ -289,38 +290,60 @@ def _series(
     )
 
 
+class _Latents(NamedTuple):
+    """Latent vectors at the frames up to a hand-over.
+
+    Attributes:
+        xhat: [until, r]; before: [until, r] x̂ a step before; rate: [until, r] dx̂/dt [1/s].
+        stress: [F, n_s] ŝ of a run that has them.
+        dt: step [s].
+    """
+
+    xhat: torch.Tensor
+    before: torch.Tensor
+    rate: torch.Tensor
+    stress: torch.Tensor | None
+    dt: float
+
+    def rows(self, start: int, stop: int) -> "_Latents":
+        """Those of some frames."""
+        xhat, before, rate = (values[start:stop] for values in self[:3])
+        stress = None if self.stress is None else self.stress[start : start + len(xhat)]
+        return _Latents(xhat, before, rate, stress, self.dt)
+
+
 def _reduced_fields(
     decoder: Decoder,
-    xhat: torch.Tensor,
-    rate: torch.Tensor,
-    stress: torch.Tensor | None,
+    latents: _Latents,
     continuation: Trajectory | None,
     frames: slice,
     carried: "_Carried | None",
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """x [F, P, 3] [m], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames of a reduced run.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """x [F, P, 3] [m], v [F, P, 3] [m/s], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames of a run.
+
+    v is the backward difference of a step, as the particles of a full-order run have it.
 
     Args:
         decoder: the fields at every particle.
-        xhat, rate: [until, r] x̂ and dx̂/dt of the frames up to the hand-over; the later frames are read.
-        stress: [F, n_s] ŝ of a run that has them.
-        continuation: full-order frames, of which the first is the last of `xhat`.
+        latents: of the frames up to the hand-over; the later frames are read.
+        continuation: full-order frames, of which the first is the last of `latents`.
         frames: which, of the whole run; those before them were read already.
         carried: gives τ and C in place of the fields.
     """
-    until, parts = len(xhat), []
-    latent, its_rate = (values[frames.start : frames.stop] for values in (xhat, rate))
-    if len(latent):
+    until, parts, now = len(latents.xhat), [], latents.rows(frames.start, frames.stop)
+    if len(now.xhat):
         if carried is None:
-            coordinates = None if stress is None else stress[frames.start : frames.start + len(latent)]
-            C, tau = decoder.affine(latent, its_rate), decoder.stress(latent, coordinates)
+            C, tau = decoder.affine(now.xhat, now.rate), decoder.stress(now.xhat, now.stress)
         else:
-            C, tau = carried.next(len(latent))
-        parts.append((decoder.position(latent), C, tau[..., _UPPER[0], _UPPER[1]]))
+            C, tau = carried.next(len(now.xhat))
+        x = decoder.position(now.xhat)
+        v = (x - decoder.position(now.before)) / now.dt
+        parts.append((x, v, C, tau[..., _UPPER[0], _UPPER[1]]))
     if frames.stop > until:
         since = slice(max(frames.start, until) - until + 1, frames.stop - until + 1)
-        x, C, tau = (torch.as_tensor(continuation.read(k, frames=since)).to(xhat) for k in ("x", "C", "tau"))
-        parts.append((x, C.unflatten(2, (3, 3)), tau))
+        read = (torch.as_tensor(continuation.read(name, frames=since)) for name in COMPONENTS)
+        x, v, C, tau = (values.to(latents.xhat) for values in read)
+        parts.append((x, v, C.unflatten(2, (3, 3)), tau))
     return tuple(torch.cat(fields) for fields in zip(*parts, strict=True))
 
 
@@ -335,18 +358,19 @@ class _Carried:
 
     Args:
         solver: takes the run's steps once more.
+        every: steps from a frame to the next.
     """
 
-    def __init__(self, solver: ReducedMPM):
+    def __init__(self, solver: ReducedMPM, every: int):
         solver.restart()
-        self._solver, self._first = solver, True
+        self._solver, self._every, self._first = solver, every, True
 
     def next(self, frames: int) -> tuple[torch.Tensor, torch.Tensor]:
         """C [F, P, 3, 3] [1/s] and τ [F, P, 3, 3] [Pa] of the next frames."""
         steps = []
         for _ in range(frames):
             if not self._first:
-                self._solver.step()
+                self._solver.step(self._every)
             self._first, span = False, self._solver.span
             order = torch.as_tensor(span.order, device=span.tau.device)
             steps.append([torch.empty_like(a).index_copy_(0, order, a) for a in (span.C, span.tau)])

@@ -22,6 +22,7 @@ from nsf.mpm.stability import largest_stable_dt
 from nsf.scenes import Scene
 
 _VALUES = 18  # of a particle and frame that are held together: the truth, and six distances from it
+_WHOLE = 1e-9  # of a step, by which a time may lie before it
 
 
 def forcing_of(scene: Scene) -> np.ndarray:
@@ -75,6 +76,7 @@ def coarse_run(
     scene: Scene,
     parameters: Mapping[str, float],
     X: np.ndarray,
+    t: np.ndarray,
     factor: int,
     precision: str,
     device: str,
@@ -86,6 +88,7 @@ def coarse_run(
         scene: the fine one.
         parameters: problem parameters by name.
         X: [P, 3] reference positions of the fine particles [m].
+        t: [F] times of the fine frames [s], ascending.
         factor: of Δx; particles become fewer by its third power.
         precision: `fp64` or `fp32`.
         device: `cpu`, `cuda` or `cuda:N`.
@@ -94,7 +97,7 @@ def coarse_run(
     Returns:
         The run; or the reason why there is none, such as a solid that the coarse grid does not resolve.
     """
-    left = scene.steps + 1  # frames
+    left = len(t)  # frames
     try:
         coarse = coarse_scene(scene, parameters, factor)
         solver = coarse.full_order(precision=precision, device=device)
@@ -104,13 +107,17 @@ def coarse_run(
         def moved() -> np.ndarray:
             return carried.value(torch.as_tensor(solver.state.numpy()["x"]) - particles).numpy()
 
-        at = np.arange(scene.steps + 1) * (coarse.steps / scene.steps)
-        below = np.minimum(at.astype(int), coarse.steps - 1)
+        at = t * (coarse.steps / (scene.steps * scene.dt))
+        below = np.minimum((at + _WHOLE).astype(int), coarse.steps - 1)
         x, ahead, taken = np.empty((len(at), *X.shape)), moved(), 0
         for frame, share in enumerate(at - below):
-            while taken <= below[frame]:
+            if taken <= below[frame]:
+                if taken < below[frame]:
+                    solver.step(int(below[frame]) - taken)
+                    ahead = moved()
+                last = ahead
                 solver.step(1)
-                last, ahead, taken = ahead, moved(), taken + 1
+                ahead, taken = moved(), int(below[frame]) + 1
             x[frame] = X + (1.0 - share) * last + share * ahead
             left -= 1
             advance(1)
@@ -174,7 +181,8 @@ def rivals(
     latents = {"nearest": tensor(runs.nearest(parameters))}
     latents["interpolated"] = tensor(runs.interpolated(parameters))
     how = setup.precision.name, setup.device, advance
-    coarse = {factor: coarse_run(scene, setup.values, trajectory.X, factor, *how) for factor in factors}
+    fine = scene, setup.values, trajectory.X, trajectory.t
+    coarse = {factor: coarse_run(*fine, factor, *how) for factor in factors}
     ran = {factor: run for factor, run in coarse.items() if not isinstance(run, str)}
     X, squares = tensor(trajectory.X), {}
     rows = frames_at_once(_VALUES * trajectory.particles, setup.dtype, setup.torch_device)

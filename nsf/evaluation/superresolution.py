@@ -127,7 +127,7 @@ def superresolve(
     for rollout in rollouts:
         started = time.perf_counter()
         build = partial(fine.full_order, rollout.case, precision, device)
-        x_full.append(_full_order_frames(build, substeps * np.array(frames)))
+        x_full.append(_full_order_frames(build, substeps * trajectories[0].every * np.array(frames)))
         full_order_seconds.append(time.perf_counter() - started)
         took = f"{len(X):,} full-order particles in {full_order_seconds[-1]:.1f} s"
         say(f"superresolve: {rollout.case.named}: {took}")

@@ -314,6 +314,10 @@ class Held:
     def __init__(self, x: np.ndarray):
         self._x, self.frames = x, len(x)
 
+    def frames_at(self, steps: np.ndarray) -> np.ndarray:
+        """The frames after some numbers of steps."""
+        return steps
+
     def read(self, _: str, frames, particles: np.ndarray | None = None) -> np.ndarray:
         """[frames, particles, 3] m."""
         x = self._x[frames]

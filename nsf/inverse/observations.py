@@ -205,8 +205,8 @@ class View:
     def of_truth(self, trajectory: Trajectory) -> np.ndarray:
         """[m] of a full-order run."""
 
-        def read(frames: np.ndarray, particles: np.ndarray | None = None) -> Tensor:
-            x = trajectory.read("x", frames=frames.tolist(), particles=particles)
+        def read(steps: np.ndarray, particles: np.ndarray | None = None) -> Tensor:
+            x = trajectory.read("x", frames=trajectory.frames_at(steps).tolist(), particles=particles)
             return torch.as_tensor(x.astype(float))
 
         seen = self._seen(

@@ -75,8 +75,7 @@ class Truth:
         return self._at("tau", t)
 
     def _at(self, field: str, t: float) -> np.ndarray:
-        last = self._trajectory.frames - 1
-        at = min(max(t / self._trajectory.dt, 0.0), float(last))
+        at = float(np.interp(t, self._trajectory.t, np.arange(self._trajectory.frames)))
         # A step's time is a whole number of Δt but for round-off. One frame is then read in place of two.
         first = round(at) if abs(at - round(at)) < 1e-6 else int(at)
         here = self._read(field, first)

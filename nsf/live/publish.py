@@ -315,7 +315,7 @@ def _recorded(
         frames = spaced(trajectory.frames, sizes.frames + 1)
         x = trajectory.read("x", frames=frames.tolist(), particles=particles)
         tau = trajectory.read("tau", frames=frames.tolist(), particles=particles)
-        t = frames * trajectory.dt
+        t = trajectory.t[frames]
     top = quantities.get("von_mises", {"top": 1.0})["top"]
     stress = von_mises(torch.as_tensor(tau)).numpy() / top
     return page.recording(np.concatenate([model.X[None, chosen], x]).astype(np.float32), stress, t)

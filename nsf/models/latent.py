@@ -57,6 +57,12 @@ class LatentModel(Model):
                 "set model=projected"
             )
 
+        if c.data.every > 1 and not self.learns:
+            raise ConfigError(
+                f"model={self.name} learns from each step, and data.every={c.data.every} stores not all; "
+                "set data.every=1"
+            )
+
     @override
     def engine(self, pipeline, manifold):
         from nsf.models.lookup import LatentEngine

@@ -173,9 +173,14 @@ class FrameRecorder:
 
 
 def blocks(
-    solver, steps: int, stored: Precision, after=lambda: None, memory: HostMemory | None = None
+    solver,
+    steps: int,
+    stored: Precision,
+    after=lambda: None,
+    memory: HostMemory | None = None,
+    every: int = 1,
 ) -> Iterator[Block]:
-    """The present state and the state after each of `steps` steps, in blocks of frames.
+    """The present state and the state after each `every`-th of `steps` steps, in blocks of frames.
 
     Args:
         solver: a `FullOrderMPM`.
@@ -183,15 +188,16 @@ def blocks(
         stored: precision of the frames.
         after: called after each frame.
         memory: host memory of the blocks, which other runs may share; their own by default.
+        every: steps from a frame to the next; divides `steps`.
 
     Raises:
         InstabilityError: the solver loses stability. The error comes after the last block if the last check
             finds it.
     """
     recorder = FrameRecorder(solver.state, solver.precision, stored, memory)
-    for n in range(steps + 1):
+    for n in range(0, steps + 1, every):
         if n:
-            solver.step()
+            solver.step(every)
         recorder.record()
         after()
         if recorder.full or n == steps:

@@ -8,6 +8,7 @@ from nsf.errors import ConfigError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
+from nsf.sampling.cubature import CubatureSampler
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
 from nsf.scenes.checks import check_memory, check_physics
@@ -34,6 +35,11 @@ def check(pipeline) -> None:
         check_batched(c.deploy.batch, field, integration.strategy)
         if pipeline.sources.carried:
             _check_carried(c.deploy.batch, sampler)
+        if c.data.every > 1 and isinstance(sampler, CubatureSampler):
+            raise ConfigError(
+                f"sampler=cubature learns from steps, and data.every={c.data.every} stores not each; set "
+                "data.every=1, or sampler=random"
+            )
         X = pipeline.scene.particles().X
         for region in sampler.regions:
             check_well_posed(region.size, c.latent_dim)
@@ -105,5 +111,6 @@ def check_room(pipeline, runs: Mapping[Run, tuple[Case, Scene]]) -> None:
         check_memory(scene, pipeline.config.precision, pipeline.device, stored)
     folder = next(iter(runs)).path.parent
     require_folder(folder)
-    frames = sum((s.steps + 1) * frame_bytes(s.particle_count, stored) for _, s in runs.values())
-    require_space(folder / f"{len(runs)} trajectories", frames)
+    every = pipeline.config.data.every
+    size = sum((s.steps // every + 1) * frame_bytes(s.particle_count, stored) for _, s in runs.values())
+    require_space(folder / f"{len(runs)} trajectories", size)

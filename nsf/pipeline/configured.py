@@ -13,7 +13,7 @@ from nsf.gpu import has_driver
 from nsf.models import Model
 from nsf.mpm import FP32, FP64, Precision
 from nsf.paths import groups, option
-from nsf.pipeline.values import check_values, factors
+from nsf.pipeline.values import check_every, check_values, factors
 from nsf.scenes import Scene
 
 if TYPE_CHECKING:
@@ -68,6 +68,8 @@ class Configured:
         self.coarse = factors("evaluation.coarse", c.evaluation.coarse)
         self.configured.refuse(self)
         self.deployed = self._deployed(c.deploy.changes)
+        for scene in (self.scene, self.deployed):
+            check_every(c.data.every, scene.steps, c.fallback)
         self.device = _device(c.device)
 
     def _deployed(self, changes: DictConfig | None) -> Scene:
@@ -100,6 +102,11 @@ class Configured:
     def stored(self) -> Precision:
         """Precision of the frames of trajectories."""
         return _STORED[self.config.data.dtype]
+
+    @property
+    def stored_frames(self) -> int:
+        """Of a trajectory."""
+        return self.scene.steps // self.config.data.every + 1
 
     @property
     def is_taught(self) -> bool:

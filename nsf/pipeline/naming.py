@@ -28,6 +28,8 @@ def simulation(pipeline, case: Case, scene: Scene) -> Run:
     content = _physics(c.scale, scene, case) | {"precision": c.precision, "dtype": c.data.dtype}
     for name, value in case.items():
         content["parameters"][name]["value"] = value
+    if c.data.every > 1:
+        content["every"] = c.data.every
     return _run(pipeline, "simulate", content)
 
 

@@ -145,6 +145,7 @@ def scene_table(pipeline: Pipeline) -> Table:
     for part in ("train", "validation", "test"):
         cases = getattr(pipeline.split, part)
         rows[part] = f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
+    rows["memory"] = _memory(pipeline)
     c = pipeline.config
     rows["deployed"] = f"on {pipeline.device}, model {pipeline.configured.name}, r {c.latent_dim}"
     if line := multiplied_step_warning(c.deploy.dt_multiplier, scene.dt, stable):
@@ -167,11 +168,24 @@ def composed(pipeline: Pipeline) -> str:
 
 def trajectory_bytes(pipeline: Pipeline) -> float:
     """Of one trajectory on disk."""
-    from nsf.mpm import FP32, FP64
     from nsf.mpm.recording import frame_bytes
 
-    stored = FP32 if pipeline.config.data.dtype == "float32" else FP64
-    return (pipeline.scene.steps + 1) * frame_bytes(pipeline.scene.particle_count, stored)
+    return pipeline.stored_frames * frame_bytes(pipeline.scene.particle_count, pipeline.stored)
+
+
+def _memory(pipeline: Pipeline) -> str:
+    """Memory that a full-order run and the training's data take."""
+    from nsf.data.snapshots import resident_bytes
+    from nsf.mpm import precision_of
+    from nsf.mpm.solver import bytes_on_device
+
+    scene, resident = pipeline.scene, pipeline.config.data.resident
+    how = precision_of(pipeline.config.precision)
+    solver = bytes_on_device(scene.particle_count, scene.grid, scene.material, how)
+    frames = len(pipeline.split.train) * pipeline.stored_frames
+    kept = "" if resident is True else ", from disk" if not resident else ", from disk where they do not fit"
+    data = bytes_text(resident_bytes(frames, scene.particle_count))
+    return f"{bytes_text(solver)} of a full-order run; {data} of {frames:,} training frames{kept}"
 
 
 def _kind(run: Run) -> str:

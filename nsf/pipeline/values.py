@@ -38,6 +38,7 @@ def check_values(c: DictConfig) -> None:
         configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
     configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
     configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
+    configuration.number("data.every", c.data.every, least=1, whole=True)
     one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
     one_of("fallback", c.fallback, FALLBACKS)
     check_tracking(c.tracking)
@@ -65,6 +66,29 @@ def factors(key: str, value) -> list[int]:
     if len(set(numbers)) < len(numbers):
         raise ConfigError(f"{key}={value} names a factor twice; give each once")
     return numbers
+
+
+def check_every(every: int, steps: int, fallback: str) -> None:
+    """Refuse stored frames between which the end of a run lies, or of which a continuation has others.
+
+    Args:
+        every: steps from a stored frame to the next.
+        steps: of a run.
+        fallback: who goes on with a run that is not believed.
+
+    Raises:
+        ConfigError: says which to set.
+    """
+    if steps % every:
+        near = max(k for k in range(1, every) if steps % k == 0)
+        raise ConfigError(
+            f"data.every={every} does not divide the {steps} steps of a run; set data.every={near}"
+        )
+    if every > 1 and fallback == "full":
+        raise ConfigError(
+            f"fallback=full stores each step, and data.every is {every}; set data.every=1, or "
+            "fallback=projected or none"
+        )
 
 
 def one_of(key: str, value, options: Sequence) -> None:

@@ -200,16 +200,13 @@ class BasisField:
 def _latent_rates(manifold: Manifold, snapshots: Snapshots) -> Tensor:
     """dx̂/dt of every training snapshot, [M, r] float64 [1/s], as a reduced step finds it.
 
-    The backward difference (x̂_n − x̂_{n−1})/Δt along each trajectory, whose frames are its steps. Before the
-    first frame the body came with its velocity: there x̂_{n−1} is that of x − Δt v.
+    That is the backward difference (x̂_n − x̂_{n−1})/Δt of steps. As particles move by x_n = x_{n−1} + Δt v_n
+    and x̂ is affine in x, the frame's velocities give it, also where the step before is not stored.
     """
-    latents, t = manifold.training_latents, snapshots.t
-    rates = torch.diff(latents, dim=0, prepend=latents[:1])
-    rates[1:] /= torch.diff(t)[:, None]
-    rows, dt = (snapshots.frame == 0).nonzero().flatten(), snapshots.trajectories[0].dt
-    x, v = (snapshots.gather(name, rows, slice(None)).double() for name in ("x", "v"))
-    rates[rows] = ((manifold.encode(x) - manifold.encode(x - dt * v)) / dt).to(rates)
-    return rates
+    still, rates = manifold.encode(torch.zeros_like(manifold.X)[None]), []
+    for rows in torch.arange(snapshots.M).split(max(1, ENCODED_ENTRIES // manifold.X.numel())):
+        rates.append(manifold.encode(snapshots.gather("v", rows, slice(None))) - still)
+    return torch.cat(rates)
 
 
 def _layered(network: nn.Module | None) -> bool:

@@ -118,11 +118,14 @@ def encoded_runs(pipeline, manifold: Manifold) -> Lessons:
 
 
 def encoded_validation(pipeline, manifold: Manifold) -> Lessons:
-    """Likewise of the stored full-order runs by which a model is chosen, none of them held out."""
+    """Likewise of the full-order runs by which a model is chosen, none of them held out."""
     encoder, pairs = encoder_of(pipeline, manifold), []
     for case in pipeline.lessons[2]:
         with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
-            run = encoded_trajectory(trajectory, encoder, pipeline.device)
+            run = encoded_trajectory(trajectory, encoder, pipeline.device) if trajectory.every == 1 else None
+        if run is None:  # not every step is stored
+            solver = pipeline.scene.full_order(case, pipeline.config.precision, pipeline.device)
+            run = streamed(solver, pipeline.scene.steps, encoder)
         pairs.append((Lesson(case, pipeline.scene.at(case)), run))
     return joined(manifold, pairs)
 
@@ -142,13 +145,14 @@ def _encoded(pipeline, encoder: Encoder, lessons: Sequence[Lesson], record: Reco
     """Files of the runs of some lessons, without those that are lost."""
     paths = [record.path / _file(index) for index in range(len(lessons))]
     steps, training = pipeline.scene.steps, pipeline.split.train
+    each_step = pipeline.config.data.every == 1  # is stored
     with Progress("teach: full-order runs", len(lessons) * steps, "steps") as progress:
         missing = []
         for lesson, path in zip(lessons, paths, strict=True):
             stored = pipeline.simulation(lesson.case)
             if intact(path, pipeline.say):
                 progress.advance(steps)
-            elif lesson.case in training and stored.complete:
+            elif each_step and lesson.case in training and stored.complete:
                 with Trajectory.open(stored.file(TRAJECTORY)) as trajectory:
                     encoded_trajectory(trajectory, encoder, pipeline.device).save(path)
                 progress.advance(steps)

@@ -46,7 +46,7 @@ def evaluate(pipeline, run: Run) -> None:
     truths, manifold = _truths(pipeline), pipeline.manifold().to(pipeline.device)  # as in deployment
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
-        frames, coarse = pipeline.deployed.steps + 1, len(pipeline.coarse)
+        frames, coarse = pipeline.deployed.steps // pipeline.config.data.every + 1, len(pipeline.coarse)
         total = len(rollouts) * ((2 + coarse) * frames - 1)  # rivals are not compared in the first
         with Progress("evaluate", total, "frames") as progress:
             pairs = [
@@ -74,7 +74,7 @@ def superresolve_held_out(pipeline, run: Run) -> None:
     c, keys, steps = pipeline.config, pipeline.config.super_resolution, pipeline.scene.steps
     truths, manifold = _truths(pipeline), pipeline.manifold()
     # Evenly spread, without frame 0, at which nothing has moved.
-    frames = spaced(steps + 1, keys.frames + 1)[1:]
+    frames = spaced(steps // c.data.every + 1, keys.frames + 1)[1:]
     with run.record(device=pipeline.device, precision=c.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
         with contextlib.ExitStack() as files:

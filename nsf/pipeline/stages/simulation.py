@@ -56,7 +56,7 @@ class Shared:
     """Values that all jobs share.
 
     Attributes:
-        steps: of each, one frame a step and one at t = 0.
+        steps: of each; every: steps from a frame to the next, the first at t = 0.
         dx: grid spacing [m], for the file.
         stored: precision of the stored frames.
         device, precision: of the physics, for the manifest.
@@ -64,11 +64,17 @@ class Shared:
     """
 
     steps: int
+    every: int
     dx: float
     stored: Precision
     device: str
     precision: str
     helpers: int = 0
+
+    @property
+    def frames(self) -> int:
+        """Of each."""
+        return self.steps // self.every + 1
 
 
 class Cost(NamedTuple):
@@ -104,7 +110,7 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
         StorageError: the disk refused a file.
         KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
     """
-    frames, help_with = len(jobs) * (shared.steps + 1), partial(_help, jobs, shared)
+    frames, help_with = len(jobs) * shared.frames, partial(_help, jobs, shared)
     with (
         Progress("simulate", frames, "frames") as progress,
         beside(help_with, shared.helpers, progress.advance) as others,
@@ -178,7 +184,7 @@ def _start(
         stored_by = pool.submit(_store, job, frames, claim.pop_all(), solver.constants, solver.dt, shared)
         started = time.perf_counter()
         try:
-            for block in blocks(solver, shared.steps, shared.stored, advance, memory):
+            for block in blocks(solver, shared.steps, shared.stored, advance, memory, shared.every):
                 _hand_over(frames, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
@@ -230,7 +236,7 @@ def _store(
             parameters=job.case.parameters,
             dt=dt,
             dx=shared.dx,
-            frames=shared.steps + 1,
+            frames=shared.frames,
             dtype=np.dtype(shared.stored.numpy).name,
             forcing=job.forcing,
         )
@@ -241,7 +247,7 @@ def _store(
                     raise item
                 for frame in item:
                     writer.append(n * dt, **frame)
-                    n += 1
+                    n += shared.every
                 item.done()
             writer.cost.update(item.cost._asdict())
         record.warn(item.warnings)
@@ -283,15 +289,16 @@ def make(
         warnings: lines of some, for their manifests.
     """
     check_room(pipeline, runs)
-    c, device = pipeline.config, pipeline.device
+    c, device, every = pipeline.config, pipeline.device, pipeline.config.data.every
 
     def job(run: Run, case: Case, scene: Scene) -> Job:
         build = partial(scene.full_order, case, c.precision, device)
-        forcing = scene.at(case).forcing_at(scene.dt * np.arange(scene.steps + 1))
+        forcing = scene.at(case).forcing_at(scene.dt * np.arange(0, scene.steps + 1, every))
         return Job(run, case, build, forcing, warnings.get(run, ()))
 
     jobs = [job(run, *needed) for run, needed in runs.items()]
     work = sum(scene.steps * scene.particle_count for _, scene in runs.values())
     helpers = min(cores(device), len(jobs)) - 1 if work > _WORTH else 0
-    shared = Shared(pipeline.scene.steps, pipeline.scene.dx, pipeline.stored, device, c.precision, helpers)
+    steps, dx = pipeline.scene.steps, pipeline.scene.dx
+    shared = Shared(steps, every, dx, pipeline.stored, device, c.precision, helpers)
     return simulate(jobs, shared, pipeline.say)

@@ -1,5 +1,6 @@
 """The stage `teach`: a model of latent vectors is fitted to encoded full-order runs."""
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -134,11 +135,13 @@ def _yardstick(pipeline, manifold: Manifold, lessons: Lessons) -> Yardstick:
     model, steps = pipeline.model, pipeline.scene.steps
     stride, particles = model.stride_of(steps), len(manifold.X)
     particles = np.sort(np.random.default_rng(0).permutation(particles)[:_PARTICLES])
-    every, truth = max(1, steps // stride // _FRAMES), []
+    stored, truth = pipeline.config.data.every, []
+    together = math.lcm(stride, stored)  # steps between frames that are stored and end a stride
+    apart = together * max(1, steps // together // _FRAMES)
     for case in pipeline.lessons[2]:
         with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
-            frames = range(0, trajectory.frames, every * stride)
-            truth.append(torch.as_tensor(trajectory.read("x", frames=list(frames), particles=particles)))
+            frames = list(range(0, trajectory.frames, apart // stored))
+            truth.append(torch.as_tensor(trajectory.read("x", frames=frames, particles=particles)))
     at = manifold.restrict(torch.as_tensor(particles), device=manifold.X.device)
 
     def positions(xhat: torch.Tensor) -> torch.Tensor:
@@ -146,4 +149,4 @@ def _yardstick(pipeline, manifold: Manifold, lessons: Lessons) -> Yardstick:
             return at.position(xhat.to(at.device)).double().cpu()
 
     runs = Runs.of(lessons, stride, model.stress_of(pipeline.forced))
-    return Yardstick(runs, positions, torch.stack(truth, 1).double(), every, stride)
+    return Yardstick(runs, positions, torch.stack(truth, 1).double(), apart // stride, stride)

@@ -13,6 +13,10 @@ from nsf.evaluation.rivals import TrainingRuns, coarse_run, coarse_scene, coarse
 from nsf.mpm import Cuboid
 
 
+def _times(scene) -> np.ndarray:
+    return scene.dt * np.arange(scene.steps + 1)
+
+
 @pytest.fixture
 def runs(tiny_manifold):
     return TrainingRuns.of(tiny_manifold)
@@ -60,7 +64,7 @@ def test_rivals_are_held_to_every_particle_and_frame(chain, tiny_manifold, truth
     ):
         g = solver.decoder().position(torch.as_tensor(xhat))[1:].numpy()
         assert error == pytest.approx(np.linalg.norm(g - x) / norm, rel=1e-5)
-    coarse = coarse_run(chain.scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
+    coarse = coarse_run(chain.scene, {"friction_angle": 26.0}, X, _times(chain.scene), 2, "fp64", "cpu")
     assert found.coarse[2]["displacement_error"] == pytest.approx(np.linalg.norm(coarse.x[1:] - x) / norm)
     assert found.coarse[2]["particles"] == coarse.particles
     assert found.factors == [2]
@@ -87,7 +91,7 @@ def test_a_coarse_run_has_the_frames_and_particles_of_the_fine_one(chain):
     scene = chain.scene
     fine = scene.at({"friction_angle": 26.0})
     X = fine.particles().X
-    coarse = coarse_run(scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
+    coarse = coarse_run(scene, {"friction_angle": 26.0}, X, _times(scene), 2, "fp64", "cpu")
     assert coarse.x.shape == (scene.steps + 1, 500, 3)
     np.testing.assert_allclose(coarse.x[0], X, atol=1e-12)
     assert coarse.dx == pytest.approx(2 * scene.dx)
@@ -100,12 +104,19 @@ def test_a_coarse_run_has_the_frames_and_particles_of_the_fine_one(chain):
     assert 0.01 < error < 0.6  # near, and not the same
 
 
+def test_frames_of_a_coarse_run_are_those_at_the_times(chain):
+    scene, case = chain.scene, {"friction_angle": 26.0}
+    X, t = scene.particles().X, _times(scene)
+    each = coarse_run(scene, case, X, t, 2, "fp64", "cpu").x
+    np.testing.assert_array_equal(coarse_run(scene, case, X, t[::6], 2, "fp64", "cpu").x, each[::6])
+
+
 def test_a_rigid_fall_is_the_same_on_a_coarse_grid(chain):
     column = {"velocity": (0.1, 0.0, 0.2), "shape.base": (0.5, 0.5, 0.5)}  # clear of the sticky floor
     column = {f"bodies.column.{key}": value for key, value in column.items()}
     scene = chain.scene.changed({"gravity": (0.0, 0.0, 0.0)} | column)
     X = scene.particles().X
-    coarse = coarse_run(scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
+    coarse = coarse_run(scene, {"friction_angle": 26.0}, X, _times(scene), 2, "fp64", "cpu")
     t = scene.dt * np.arange(scene.steps + 1)[:, None, None]
     np.testing.assert_allclose(coarse.x, X + t * np.array([0.1, 0.0, 0.2]), atol=1e-10)
 
@@ -114,7 +125,8 @@ def test_a_scene_that_no_coarse_grid_resolves_says_why(chain):
     blade = Cuboid((0.8, 0.8, 0.8), (0.07, 0.07, 0.07), "separate")
     scene = replace(chain.scene, colliders={**chain.scene.colliders, "blade": blade})
     told = []
-    reason = coarse_run(scene, {"friction_angle": 26.0}, scene.particles().X, 2, "fp64", "cpu", told.append)
+    fine = scene, {"friction_angle": 26.0}, scene.particles().X, _times(scene)
+    reason = coarse_run(*fine, 2, "fp64", "cpu", told.append)
     assert "needs dx of at most" in reason
     assert told == [scene.steps + 1]
 

@@ -73,7 +73,8 @@ def test_c_is_affine_in_the_rate(rated):
 def test_training_rates_are_backward_differences(rated):
     latents = rated.training_latents.unflatten(0, (3, FRAMES))
     rates = rated.training_rates.unflatten(0, (3, FRAMES))
-    torch.testing.assert_close(rates[:, 1:], torch.diff(latents, dim=1) / DT)
+    # They follow from velocities, and positions are read in float32.
+    torch.testing.assert_close(rates[:, 1:], torch.diff(latents, dim=1) / DT, rtol=1e-3, atol=1e-4)
     # Before the first frame a body came with its velocity: one more step of the same motion.
     assert (rates[:, 0] - rates[:, 1]).abs().max() < 0.2 * rates[:, 1].abs().max()
 
