@@ -5,6 +5,7 @@ from torch import Tensor
 
 _HOST_BYTES = 2**25  # of a block on the CPU: about its last cache
 _SHARE = 0.25  # of the free memory of a GPU
+_SLICES = 128  # of a product, which a GPU works on side by side
 #: Modes of a tile of the product on the CPU [values]: about the second level of its cache.
 TILE = 2**18
 
@@ -35,3 +36,14 @@ def tf32_error(coefficients: Tensor, modes: Tensor, rows: int = 3 * 500) -> floa
 def _as_tf32(values: Tensor) -> Tensor:
     """float32 with the 10 bits of mantissa that tensor cores take, to the nearest."""
     return ((values.contiguous().view(torch.int32) + 0x1000) & ~0x1FFF).view(torch.float32)
+
+
+def coordinates(values: Tensor, modes: Tensor) -> Tensor:
+    """Products [F, k] of few rows [F, n] with modes [n, k], n ≫ F, k.
+
+    Summed over slices of n: in one product of that shape most of a GPU may be idle.
+    """
+    width = len(modes) // _SLICES
+    whole = _SLICES * width
+    parts = values[:, :whole].unflatten(1, (_SLICES, width)).transpose(0, 1)
+    return (parts @ modes[:whole].unflatten(0, (_SLICES, width))).sum(0) + values[:, whole:] @ modes[whole:]

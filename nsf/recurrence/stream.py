@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nsf.data import archives
 from nsf.errors import ConfigError, SchemaError
+from nsf.kinematics.blocks import coordinates
 from nsf.mpm import FP32
 from nsf.mpm.recording import FrameRecorder
 from nsf.storage import writing
@@ -76,7 +77,8 @@ class Encoder:
     def __call__(self, x: Tensor, tau: Tensor) -> tuple[np.ndarray, np.ndarray]:
         """x̂ [F, r] and ŝ [F, n_s], float32, of positions [F, P, 3] [m] and τ [F, P, 6] [Pa]."""
         xhat = self.manifold.encode(x)
-        shat = xhat[:, :0] if self._modes is None else tau.flatten(1).to(self._modes) @ self._modes
+        modes = self._modes
+        shat = xhat[:, :0] if modes is None else coordinates(tau.flatten(1).to(modes), modes)
         return xhat.float().cpu().numpy(), shat.float().cpu().numpy()
 
 

@@ -26,6 +26,7 @@ from typing_extensions import override
 
 from nsf.data import Snapshots
 from nsf.errors import ConfigError
+from nsf.kinematics.blocks import coordinates
 from nsf.kinematics.fields import pod
 from nsf.kinematics.fields.modal import (
     ModalFactors,
@@ -296,7 +297,7 @@ class BasisManifold(Manifold):
         origin = self.X + field.mean
         rows = (field.modes[..., : self.latent_dim].double() / field.leading).flatten(0, 1)
         blocks = x.split(max(1, ENCODED_ENTRIES // origin.numel()))
-        return torch.cat([(block.to(origin) - origin).flatten(1) @ rows for block in blocks])
+        return torch.cat([coordinates((block.to(origin) - origin).flatten(1), rows) for block in blocks])
 
     @override
     @torch.no_grad()

@@ -41,3 +41,10 @@ def test_rounding_to_tf32_is_that_of_its_mantissa():
 
 def test_a_block_has_a_frame_at_least():
     assert blocks.frames_at_once(10**12, torch.float64, "cpu") == 1
+
+
+@pytest.mark.parametrize("n", [90, 128, 1001])
+def test_coordinates_are_those_of_one_product(n):
+    generator = torch.Generator().manual_seed(0)
+    values, modes = (torch.randn(*shape, generator=generator).double() for shape in ((7, n), (n, 5)))
+    torch.testing.assert_close(blocks.coordinates(values, modes), values @ modes)
