@@ -18,6 +18,7 @@ from nsf.bench.measure import build
 from nsf.bench.rows import Case, Measurements, size_name
 from nsf.bench.scaling import at_size
 from nsf.data import Case as Parameters
+from nsf.deployment import Trust
 from nsf.errors import NSFError
 from nsf.evaluation import metrics
 from nsf.evaluation.rivals import coarse_scene
@@ -130,19 +131,20 @@ class Decoded:
         solver: a `ReducedMPM`.
         at: the fields at all particles, in fp32.
         tolerance: by which decoding may be off; see `Restriction.positions`.
-        error_bar: whether the spread of members is computed.
+        error_bar: whether the run says of its error what bounds it (`Trust.signal`).
     """
 
     def __init__(self, solver, at: Restriction, tolerance: float, error_bar: bool = True):
-        self.solver, self._at, self._tolerance, self._error_bar = solver, at, tolerance, error_bar
-        self.restart, self._span = solver.restart, solver.together.span_at(0)
-        self.spread: torch.Tensor | None = None
+        self.solver, self._at, self._tolerance = solver, at, tolerance
+        self.restart = solver.restart
+        self._trust = Trust.of(solver.manifold, 1.0) if error_bar else None
+        self.signal: np.ndarray | None = None
 
     def run(self) -> None:
         """Take every step and decode every frame."""
         self.solver.step(self.solver.total_steps)
-        if self._error_bar:
-            self.spread = self._span.spread(self.solver.total_steps)
+        if self._trust is not None:
+            self.signal = self._trust.signal_of(self.solver)
         for _ in self._at.positions(self.solver.record.xhat, self._tolerance):
             pass
 
@@ -250,11 +252,9 @@ def _add_errors(figures: Measurements, sides: Mapping[Case, FullOrder | Decoded]
             continue
         if isinstance(side, Decoded):
             off = torch.stack(side.positions_after(steps.tolist())) - x
-            if side.spread is not None:
+            if side.signal is not None:
                 size = (moved / len(x) / len(X)) ** 0.5
-                figures.add(
-                    case, "error bar", float(side.spread[0, steps].square().mean().sqrt()) / size, "1"
-                )
+                figures.add(case, "error bar", float(np.sqrt(np.mean(side.signal[steps] ** 2))) / size, "1")
         else:
             off = X + _carried(side, steps * side.scene.steps // scene.steps, X, figures.settings.device) - x
         error = float(metrics.frame_squares(off).sum() / moved) ** 0.5

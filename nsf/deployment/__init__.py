@@ -1,34 +1,33 @@
-"""Reduced runs of held-out cases: records, an estimate of trust, and who goes on where it is lost."""
+"""Reduced runs of held-out cases: records, a bound of their errors, and whether to believe them."""
 
 from typing import TYPE_CHECKING
 
-from nsf.deployment.fallback import Fallback, go_on, hand_over
-from nsf.deployment.rollout import (
-    FULL_ORDER,
-    LATENT_MODEL,
-    PROJECTED,
-    Rollout,
-    continuation_file,
-    rollout_file,
-)
-from nsf.deployment.trust import Trust, calibrate
+from nsf.deployment.bound import AMBER, FLAGS, GREEN, RED, UNKNOWN, Calibration
+from nsf.deployment.reach import Band, Reach
+from nsf.deployment.rollout import FULL_ORDER, PROJECTED, Rollout, continuation_file, rollout_file
+from nsf.deployment.trust import TRUST, Trust, Verdict
 from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.deployment.running import deploy, rollouts
 
 __all__ = [
+    "AMBER",
+    "FLAGS",
     "FULL_ORDER",
-    "LATENT_MODEL",
+    "GREEN",
     "PROJECTED",
-    "Fallback",
+    "RED",
+    "TRUST",
+    "UNKNOWN",
+    "Band",
+    "Calibration",
+    "Reach",
     "Rollout",
     "Trust",
-    "calibrate",
+    "Verdict",
     "continuation_file",
     "deploy",
-    "go_on",
-    "hand_over",
     "rollout_file",
     "rollouts",
 ]

@@ -1,7 +1,6 @@
 """The record of a reduced run, and its file."""
 
 import io
-import math
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,23 +9,23 @@ import h5py
 import numpy as np
 
 from nsf.data import Case, hdf5
-from nsf.deployment.trust import first_distrusted
+from nsf.deployment.trust import Verdict
 from nsf.dynamics import STOP_REASONS
 from nsf.errors import SchemaError
 from nsf.storage import writing
 
-#: Who takes a step: a model of latent vectors alone, the projected step, the full-order solver.
-LATENT_MODEL, PROJECTED, FULL_ORDER = range(3)
-LEVELS = ("latent_model", "projected", "full_order")
+#: Who takes a run whose bound passes the limit.
+PROJECTED, FULL_ORDER = "projected", "full"
 #: Stands for a stop reason where a step of the latent vector alone ends in no inversion.
 LATENT = "latent"
 
-_VERSION = 4
+_VERSION = 5
 _SCALARS = {
-    "away": float, "sample": int, "integration_mean": float, "needed_outside": int, "seconds": float,
-    "diverged": int, "handed_over": int,
+    "sample": int, "integration_mean": float, "needed_outside": int, "seconds": float, "diverged": int,
+    "by": str,
 }  # fmt: skip
-_ARRAYS = ("t", "xhat", "residuals", "trust")
+_VERDICT = {"displacement": float, "limit": float, "reason": str, "beyond": bool}
+_ARRAYS = ("t", "xhat", "residuals", "signal")
 _REAL = ("<f4", "<f8")  # types of the arrays: that of the run
 
 
@@ -38,18 +37,14 @@ class Rollout:
         case: its problem parameters.
         t: [N + 1] time [s]; xhat: [N + 1, r] latent vectors.
         residuals: [N, k + 1] projection residuals [m]; stops: [N] stop reasons.
-        trust: [N + 1] how far each step is from the training data, in units of how far these are from
-            themselves (`Trust.ratios`, and `away` where that is above 1).
-        away: how far the case is from the training cases, in units of their spacing (`CaseDistance`).
+        signal: [N + 1] what the run says of its error [m] (`Trust.signal`).
+        verdict: its error, as far as it can be told, and whether to believe it.
         sample: |S| of the first span of time; integration_mean: mean |N| over all steps taken.
         needed_outside: most particles or nodes outside the superset that a step needed.
         seconds: wall time of the steps, without set-up; of a batch, an equal share of it.
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
-        handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
-            end with the first distrusted one.
-        estimate: [N + 1] how far the members of a model are from their mean at S [m]; None of a single one.
-        by: [N] who took each step (`LATENT_MODEL`, `PROJECTED`; `FULL_ORDER` from `handed_over` on); None for
-            a run whose model projects itself.
+        by: the model that took the run from its beginning in place of the first, `projected` or `full`; empty
+            where none did. A run by the full-order solver has no steps here, and its frames in another file.
         stress: [N + 1, n_s] ŝ, coordinates of τ, of a run whose model has them; None of others.
     """
 
@@ -58,44 +53,20 @@ class Rollout:
     xhat: np.ndarray
     residuals: np.ndarray
     stops: list[str]
-    trust: np.ndarray
-    away: float
+    signal: np.ndarray
+    verdict: Verdict
     sample: int
     integration_mean: float
     needed_outside: int
     seconds: float
     diverged: int
-    handed_over: int = -1
-    estimate: np.ndarray | None = None
-    by: np.ndarray | None = None
+    by: str = ""
     stress: np.ndarray | None = None
 
     @property
-    def levels(self) -> np.ndarray:
-        """[N] `by` of any run."""
-        by = np.full(len(self.stops), PROJECTED) if self.by is None else self.by
-        handed = (self.handed_over >= 0) & (np.arange(len(by)) >= self.handed_over)
-        return np.where(handed, FULL_ORDER, by).astype(np.int8)
-
-    @property
-    def projected_share(self) -> float:
-        """Share of steps, in a run of another model, that the projected step took; 0 of any other run."""
-        return 0.0 if self.by is None else float((self.levels == PROJECTED).sum()) / max(1, len(self.by))
-
-    @property
-    def by_latent_model(self) -> int:
-        """How many steps a model of latent vectors alone took."""
-        return int((self.levels == LATENT_MODEL).sum())
-
-    @property
-    def estimated_error(self) -> float:
-        """Largest of `estimate` [m]; NaN where nothing is estimated, or another model took every step."""
-        return math.nan if self.estimate is None or not self.by_latent_model else float(self.estimate.max())
-
-    @property
-    def distrusted(self) -> int:
-        """First step that is not to be believed (ratio above 1), −1 when there is none."""
-        return first_distrusted(self.trust)
+    def handed_over(self) -> int:
+        """Step from whose state the full-order solver goes on, which is the first; −1 where it does not."""
+        return 0 if self.by == FULL_ORDER else -1
 
     def save(self, path: Path) -> None:
         """Write as HDF5, whole or not at all."""
@@ -103,12 +74,11 @@ class Rollout:
         memory = io.BytesIO()
         with h5py.File(memory, "w") as file:
             file.attrs.update({"nsf_rollout": _VERSION} | {name: getattr(self, name) for name in _SCALARS})
+            file.attrs.update({name: getattr(self.verdict, name) for name in _VERDICT})
             for name in _ARRAYS:
                 file[name] = getattr(self, name)
-            if self.by is not None:
-                file["by"] = self.levels
-            if self.estimate is not None:
-                file["estimate"] = self.estimate
+            for name in ("error", "bound"):
+                file[name] = getattr(self.verdict, name)
             if self.stress is not None:
                 file["stress"] = self.stress
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
@@ -140,18 +110,17 @@ class Rollout:
                 raise SchemaError(f"is not a rollout of version {_VERSION} (found {version})")
             scalars = {name: hdf5.attribute(file, name, kind) for name, kind in _SCALARS.items()}
             t = hdf5.values(file, "t", _REAL, (None,), increasing=True)
-            shapes = {"xhat": (len(t), latent_dim), "residuals": (len(t) - 1, None), "trust": (len(t),)}
+            shapes = {"xhat": (len(t), latent_dim), "residuals": (len(t) - 1, None), "signal": (len(t),)}
             arrays = {name: hdf5.array(file, name, _REAL, shape)[()] for name, shape in shapes.items()}
+            told = {name: hdf5.attribute(file, name, kind) for name, kind in _VERDICT.items()}
+            errors = [hdf5.array(file, name, ("<f8",), (len(t),))[()] for name in ("error", "bound")]
             stops = hdf5.texts(file, "stops", (len(t) - 1,))
             numbers = hdf5.values(file, "case", ("<f8",), (None,))
             names, units = (hdf5.texts(file, f"case_{name}", numbers.shape) for name in ("names", "units"))
-            if "by" in file:
-                arrays["by"] = hdf5.array(file, "by", ("|i1",), (len(t) - 1,))[()]
-            if "estimate" in file:
-                arrays["estimate"] = hdf5.array(file, "estimate", _REAL, (len(t),))[()]
             if "stress" in file:
                 arrays["stress"] = hdf5.array(file, "stress", _REAL, (len(t), None))[()]
-            rollout = cls(Case(names, numbers, units), **scalars, t=t, **arrays, stops=stops)
+            verdict = Verdict(*errors, **told)
+            rollout = cls(Case(names, numbers, units), **scalars, t=t, **arrays, stops=stops, verdict=verdict)
             rollout._check()
         return rollout
 
@@ -162,25 +131,22 @@ class Rollout:
             ("sample", 1, np.inf),
             ("needed_outside", 0, np.inf),
             ("diverged", -1, steps),
-            ("handed_over", -1, steps),
             ("seconds", 0, np.inf),
-            ("away", 0, np.inf),
             ("integration_mean", 0, np.inf),
         ):
             if not least <= getattr(self, name) <= most:
                 raise SchemaError(f"has {name}={getattr(self, name)}, in {steps} steps")
-        # A run that diverged, or was handed over before it did, may end in what is not finite.
-        last = (
-            self.handed_over if self.handed_over >= 0 else self.diverged - 1 if self.diverged >= 0 else steps
-        )
+        # A run that diverged may end in what is not finite.
+        last = self.diverged - 1 if self.diverged >= 0 else steps
         hdf5.check("xhat", self.xhat[: max(0, last) + 1])
         hdf5.check("residuals", self.residuals[: max(0, last)])
-        for name in ("trust", "estimate"):
-            values = getattr(self, name)
-            if values is not None and not (values >= 0).all():
-                raise SchemaError(f"has values of {name} that are negative or no numbers")
-        if self.by is not None and not np.isin(self.by, range(len(LEVELS))).all():
-            raise SchemaError("has steps by none of " + ", ".join(LEVELS))
+        if not (self.signal >= 0).all() or not self.verdict.displacement >= 0 or not self.verdict.limit > 0:
+            raise SchemaError("has a signal, displacement or limit that is negative or no number")
+        for errors in (self.verdict.error, self.verdict.bound):
+            if (errors < 0).any():
+                raise SchemaError("has errors that are negative")
+        if self.by not in ("", PROJECTED, FULL_ORDER):
+            raise SchemaError(f"has by={self.by!r}, which is no model that takes runs")
         if unknown := set(self.stops) - {*STOP_REASONS, LATENT}:
             raise SchemaError(f"has stops={sorted(unknown)[0]!r}, which is no reason to stop")
 

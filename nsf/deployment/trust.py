@@ -1,365 +1,300 @@
-"""Whether to believe a reduced run: how far it is from what its fields were trained on.
+"""Whether to believe a reduced run: a bound of its error, and what it left that its model was taught.
 
-Three signals tell when a run leaves its training data: the sample particles move where no latent vector can
-follow, which leaves a projection residual; the latent vector goes where no training snapshot was; and the
-problem parameters, or what forces the run, lie outside of training. Each is measured in units of what
-training data themselves show, so that a ratio of 1 means "as far as training data are from themselves". Not
-in the paper.
+A run tells of itself how far, in metres, members of a model are from their mean; or, of a single model, how
+far its latent vectors are from those of training and what its projections left. Validation runs say how large
+errors are at such signals (`nsf.deployment.bound`). Not in the paper.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial.distance import cdist
+from scipy.spatial import cKDTree
 
-from nsf.data.normalize import deviation
+from nsf.deployment.bound import RED, Calibration, flag_of, rms
+from nsf.deployment.reach import Reach
 from nsf.dynamics import ReducedMPM
-from nsf.progress import Progress
-from nsf.recurrence.solids import FEATURES, collider_states
+from nsf.errors import SchemaError
+from nsf.recurrence.solids import collider_states
+from nsf.storage import write_json
+from nsf.vectors import spaced
 
-#: Of the distances between training trajectories: the largest ones are of single frames.
-QUANTILE = 0.95
-#: A calibration run gone astray must not vouch for others: beyond this many medians it does not count.
-STRAY = 2.0
-#: Of a value: what float32 may have moved it by.
-_ROUND_OFF = 1e-6
-#: Of how far the extreme one of training's programs stands out: a new one of the kind may stand out further.
-_AGAIN = 2.0
-_ROWS = 256  # steps decoded, and held with their distances to all training snapshots, at once
-
-
-class LatentDistance:
-    """How far latent vectors are from the training latents, as a distance of the sample particles [m].
-
-    The RMS distance of g(X_S, x̂) to the nearest g(X_S, x̂_train). Between latents of unit variance a
-    component that hardly moves anything would count as much as the first.
-
-    Args:
-        manifold: trained fields.
-        particles: [s] indices of S, of all phases.
-        device: torch device.
-    """
-
-    def __init__(self, manifold, particles: np.ndarray, device: str | torch.device = "cpu"):
-        self._at = manifold.restrict(particles=torch.as_tensor(particles), device=device)
-        self._latents = manifold.training_latents
-        training = self._positions(manifold.training_latents)
-        self._origin = training.mean(0)  # near which distances lose fewer digits
-        self._training = training - self._origin
-        self._trajectories = manifold.training_trajectories.to(device)
-
-    def of(self, xhat: np.ndarray) -> np.ndarray:
-        """Distance [n] [m] of latent vectors [n, r] to the nearest training latent; NaN where x̂ is."""
-        return _nearest(self._positions(torch.as_tensor(xhat)) - self._origin, self._training).cpu().numpy()
-
-    def between_trajectories(self) -> np.ndarray:
-        """[M] distance [m] of each training latent to the nearest of another trajectory; [0] if none."""
-        distances = [np.zeros(0)]
-        for k in self._trajectories.unique():
-            inside = self._trajectories == k
-            if not inside.all():
-                distances.append(_nearest(self._training[inside], self._training[~inside]).cpu().numpy())
-        return np.concatenate(distances)
-
-    def embedded(self, error: float) -> tuple[np.ndarray, np.ndarray]:
-        """The same distances between few numbers, where positions are modes times coefficients.
-
-        Args:
-            error: by which any distance between training latents may be off [m].
-
-        Returns:
-            [q, K]: distances of its products with coefficients a(x̂) are those of `of`; and [M, q], the
-            products of the training latents.
-        """
-        modes = self._at.fields["deformation"].modes.flatten(0, 1).double().cpu().numpy()
-        modes = modes / self._at.points**0.5
-        a = self._coefficients(self._latents).cpu().numpy()
-        R = np.linalg.qr(modes, mode="r")
-        y = (a - a.mean(0)) @ R.T
-        _, _, axes = np.linalg.svd(y, full_matrices=False)
-        squares = (y @ axes.T) ** 2
-        beyond = np.sqrt(np.cumsum(squares[:, ::-1], axis=1)[:, ::-1]).max(0)  # in this and further axes
-        count = max(1, int((2.0 * beyond > error).sum()))
-        matrix = axes[:count] @ R
-        return matrix, a @ matrix.T
-
-    def nearly(self, error: float) -> Callable[[torch.Tensor], torch.Tensor]:
-        """`of` for many latent vectors [n, r], off by `error` [m] at most; [n] on their device.
-
-        Where positions are modes times coefficients it takes a fraction of the time.
-        """
-        if not hasattr(self._at, "fields") or not hasattr(self._at.fields["deformation"], "modes"):
-            return lambda xhat: torch.as_tensor(self.of(xhat.cpu().numpy())).to(xhat)
-        matrix, training = (torch.as_tensor(a, device=self._at.device) for a in self.embedded(error))
-        return lambda xhat: _nearest(self._coefficients(xhat) @ matrix.T, training)
-
-    def _coefficients(self, latents: torch.Tensor) -> torch.Tensor:
-        """a(x̂) [n, K] in fp64, of a field of modes times coefficients."""
-        field, latents = self._at.fields["deformation"], latents.to(self._at.device, self._at.dtype)
-        with torch.no_grad():
-            closed = [] if field.network is None else [field.network(latents)]
-        return torch.cat([latents, *closed], 1).double()
-
-    def _positions(self, latents: torch.Tensor) -> torch.Tensor:
-        """g(X_S, x̂) [n, 3 s] over √s: Euclidean distances of rows are RMS distances of particles."""
-        latents = latents.to(self._at.device, self._at.dtype)
-        with torch.no_grad():
-            rows = [self._at.position(part).flatten(1) for part in latents.split(_ROWS)]
-        return torch.cat(rows) / self._at.points**0.5
-
-
-class CaseDistance:
-    """How far a case is from the training cases, in units of their own spacing.
-
-    Parameters are standardised over the training cases. Their spacing is the longest edge of their minimum
-    spanning tree: the longest step that it takes to go from any case to any other by way of further ones.
-
-    Args:
-        manifold: trained fields.
-    """
-
-    def __init__(self, manifold):
-        self._names = manifold.parameter_names
-        self._values = np.unique(manifold.training_parameters.cpu().numpy(), axis=0)
-        self._deviation = deviation(self._values)
-        standard = self._values / self._deviation
-        self._spacing = float(minimum_spanning_tree(cdist(standard, standard)).max()) or 1.0
-
-    def of(self, case: Mapping[str, float]) -> float:
-        """The ratio: the distance to the nearest training case, or 1 and the way into their box from outside.
-
-        In one parameter it is at most 1/2 between the training values. 0 where nothing varies.
-        """
-        if not self._names:
-            return 0.0
-        at, low, high = [case[name] for name in self._names], self._values.min(0), self._values.max(0)
-        beyond = np.maximum(np.maximum(low - at, at - high), 0.0)
-        beyond = np.where(beyond > _ROUND_OFF * np.maximum(abs(low), abs(high)), beyond, 0.0)
-        nearest = cdist([at / self._deviation], self._values / self._deviation).min()
-        outside = float(np.linalg.norm(beyond / self._deviation))
-        return max(float(nearest) / self._spacing, 1.0 + outside / self._spacing if outside else 0.0)
-
-    def plain(self) -> dict:
-        """The training cases, the deviation of each parameter among them, and their spacing."""
-        return {
-            "cases": self._values.tolist(),
-            "deviation": self._deviation.tolist(),
-            "spacing": self._spacing,
-        }
-
-    def extremes(self) -> list[dict[str, float]]:
-        """First, middle and last training case along each parameter, without repetition."""
-        count = len(self._values)
-        rows = {
-            int(order[at])
-            for order in np.argsort(self._values, axis=0, kind="stable").T
-            for at in (0, count // 2, count - 1)
-        }
-        return [dict(zip(self._names, self._values[row].tolist(), strict=True)) for row in sorted(rows)]
-
-
-class SolidsRange:
-    """How far solids leave the poses and speeds that programs of training gave them.
-
-    Each number of a solid's state, shift [m], angle [rad] and both velocities, has its range over all
-    training runs; it counts from the middle, in units of the half. A run that is drawn like them may go
-    beyond by twice as much as the one of them that goes furthest beyond the ranges of the others. Ranges do
-    not see numbers that are usual one by one and unusual together, as fast where it is deep.
-
-    Args:
-        states: [M, N, f] of training runs, as `collider_states` gives them; M of 1 leaves no leeway.
-        dt: their step [s].
-    """
-
-    def __init__(self, states: np.ndarray, dt: float):
-        rows = _velocities(states, dt)
-        low, high = rows.min(1), rows.max(1)
-        self._middle, self._half = _range(low, high)
-        self._round_off = _ROUND_OFF * np.abs(rows).max((0, 1))
-        beyond = [1.0]
-        for run in range(len(rows)) if len(rows) > 1 else ():
-            without = _range(np.delete(low, run, 0), np.delete(high, run, 0))
-            ratios = self._of(rows[run], *without)
-            beyond.append(float(ratios[np.isfinite(ratios)].max(initial=1.0)))
-        self._leeway = 1.0 + _AGAIN * (max(beyond) - 1.0)
-
-    def of(self, states: np.ndarray, dt: float) -> np.ndarray:
-        """The ratio [...] of states [..., f] in steps of dt [s]; above 1 no training run was like it."""
-        return self._of(_velocities(states, dt), self._middle, self._half).max(-1, initial=0.0) / self._leeway
-
-    def _of(self, rows: np.ndarray, middle: np.ndarray, half: np.ndarray) -> np.ndarray:
-        distance = np.maximum(np.abs(rows - middle) - self._round_off, 0.0)
-        return np.divide(distance, half, out=np.where(distance > 0.0, np.inf, 0.0), where=half > 0.0)
-
-
-def _range(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and half [f] of what runs reach at least and at most [M, f]."""
-    return 0.5 * (high.max(0) + low.min(0)), 0.5 * (high.max(0) - low.min(0))
-
-
-def _velocities(states: np.ndarray, dt: float) -> np.ndarray:
-    """States [..., f] with velocities in place of changes in a step."""
-    rows = states.reshape(*states.shape[:-1], -1, FEATURES).copy()
-    rows[..., 4:8] /= dt
-    return rows.reshape(states.shape)
+#: File of a deploy run with what bounds the errors of its model.
+TRUST = "trust.json"
+#: Particles at which displacements are taken, and training states that tell of them or of distances.
+_PARTICLES, _ROWS, _NEAREST = 500, 256, 4096
+#: Growth of a bound a side of the box of parameters away from the nearest validation case.
+_AWAY = 0.5
 
 
 @dataclass(frozen=True)
-class Trust:
-    """The estimate, calibrated on training data.
+class Verdict:
+    """The error of a run, as far as it can be told without the full-order one.
 
     Attributes:
-        residual: scale of projection residuals [m].
-        distance: scale of the latent distance [m].
-        latent_distance: the distance itself.
-        cases: distance from the training cases.
-        gravity: middle [3] and radius [m/s²] of what programs of training may give; None without any.
-        solids: what programs of training did with solids; None where they move none.
+        error: [N + 1] expected RMS distance over particles [m]; bound: it is no larger in `LEVEL` of runs.
+            NaN where no validation run tells.
+        displacement: RMS over the run [m], of which errors are shares.
+        limit: share of the displacement above which a run is not believed.
+        reason: why it is not to be believed, or nothing is told; empty where the bound alone tells.
+        beyond: whether it left what was taught.
     """
 
-    residual: float
-    distance: float
-    latent_distance: LatentDistance
-    cases: CaseDistance
-    gravity: tuple[Sequence[float], float] | None = None
-    solids: SolidsRange | None = None
+    error: np.ndarray
+    bound: np.ndarray
+    displacement: float
+    limit: float
+    reason: str = ""
+    beyond: bool = False
+
+    @property
+    def error_share(self) -> float:
+        """Expected error of the whole run, a share of its displacement."""
+        return _share(self.error, self.displacement)
+
+    @property
+    def bound_share(self) -> float:
+        """Its bound, likewise."""
+        return _share(self.bound, self.displacement)
+
+    @property
+    def flag(self) -> str:
+        """Green, amber, red or unknown."""
+        return RED if self.beyond else flag_of(self.bound_share, self.limit)
+
+    @property
+    def text(self) -> str:
+        """The light in words: `amber: error 7.1 %, at most 14 % of the displacement`."""
+        told = ""
+        if not np.isnan(self.bound_share):
+            told = (
+                f"error {percent(self.error_share)}, at most {percent(self.bound_share)} of the displacement"
+            )
+        return f"{self.flag}: " + "; ".join(part for part in (told, self.reason) if part)
+
+
+def percent(share: float) -> str:
+    """A share as `7.1 %`."""
+    return "∞" if np.isinf(share) else "–" if np.isnan(share) else f"{100.0 * share:.3g} %"
+
+
+def bound_text(bound: float, limit: float) -> str:
+    """Why a run is red, of its bound and the limit."""
+    why = f"its error bound is {percent(bound)} of the displacement, above {percent(limit)}"
+    return why if np.isfinite(bound) else "it left what was taught, or is lost"
+
+
+def _share(values: np.ndarray, displacement: float) -> float:
+    whole = float(rms(values))
+    with np.errstate(divide="ignore"):
+        return whole if whole == 0.0 or np.isnan(whole) else float(np.divide(whole, displacement))
+
+
+def metric_of(manifold) -> np.ndarray:
+    """[r, r] L: |Δx̂ L| is about the RMS over particles of how far Δx̂ moves them [m].
+
+    From a linear fit of positions at training states, so that no distance needs a field.
+    """
+    particles = np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_PARTICLES])
+    device, latents = manifold.X.device, manifold.training_latents
+    at = manifold.restrict(torch.as_tensor(particles), device=device)
+    rows = latents[torch.as_tensor(spaced(len(latents), _ROWS), device=latents.device)]
+    with torch.no_grad():
+        x = at.position(rows.to(device, at.dtype)).double().cpu().numpy().reshape(len(rows), -1)
+    xhat = rows.double().cpu().numpy()
+    moves = np.linalg.lstsq(xhat - xhat.mean(0), x - x.mean(0), rcond=None)[0]
+    values, axes = np.linalg.eigh(moves @ moves.T / len(particles))
+    return axes * np.sqrt(np.maximum(values, 0.0))
+
+
+class Trust:
+    """Bounds the errors of the runs of one model.
+
+    Args:
+        metric: [r, r] of latent vectors (`metric_of`).
+        taught: [K, r] latent vectors of training.
+        reach: what was taught; None: nothing is known of it.
+        calibration: of validation runs; None where there are none.
+        validated: [n, p] parameters of their cases.
+        limit: share of the displacement above which a run is not believed.
+        unknown: why nothing is told, where nothing is.
+    """
+
+    unknown = "no validation run tells; set scene.design.validation"
+
+    def __init__(
+        self,
+        metric: np.ndarray,
+        taught: np.ndarray,
+        limit: float,
+        reach: Reach | None = None,
+        calibration: Calibration | None = None,
+        validated: np.ndarray | None = None,
+    ):
+        self.metric, self.limit, self.reach, self.calibration = metric, limit, reach, calibration
+        self.validated = np.zeros((0, 0)) if validated is None else validated
+        self._taught = taught
 
     @classmethod
-    def calibrated(
-        cls,
-        latent_distance: LatentDistance,
-        cases: CaseDistance,
-        runs: Sequence[tuple[np.ndarray, np.ndarray]],
-    ) -> Trust:
-        """From reduced runs of training cases.
+    def of(cls, manifold, limit: float, *further) -> "Trust":
+        """Of a trained manifold."""
+        return cls(metric_of(manifold), manifold.training_latents.double().cpu().numpy(), limit, *further)
 
-        The residual's scale is the largest that these runs leave; but at most `STRAY` times the median of
-        each run's largest, as a run of a training case may go astray too. The distance's is how far these
-        runs go by the same rule, or the `QUANTILE` of what separates each training trajectory from the
-        others where that is more.
+    @classmethod
+    def open(cls, path: Path, manifold) -> "Trust":
+        """Of the file that a deploy run has of it.
 
-        Args:
-            latent_distance: distance from the training latents.
-            cases: distance from the training cases.
-            runs: x̂ [N + 1, r] and residuals [N] [m] of each run, as for `ratios`, as far as it went well;
-                none where no run takes projected steps, so that distances alone count.
+        Raises:
+            SchemaError: the file is none.
         """
-        distances = latent_distance.between_trajectories()
-        separation = float(np.quantile(distances, QUANTILE)) if len(distances) else 0.0
-        drift = _largest([latent_distance.of(xhat) for xhat, _ in runs])
-        residual = _largest([residuals for _, residuals in runs])
-        return cls(residual, max(separation, drift), latent_distance, cases)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            metric = np.asarray(content["metric"], float)
+            calibration = content["calibration"] and Calibration.read(content["calibration"])
+            r = manifold.latent_dim
+            if metric.shape != (r, r):
+                raise ValueError(f"metric has shape {metric.shape}, not ({r}, {r})")
+            taught = manifold.training_latents.double().cpu().numpy()
+            validated = np.asarray(content["validated"], float)
+            return cls(
+                metric, taught, float(content["limit"]), Reach.read(content["reach"]), calibration, validated
+            )
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise SchemaError(f"{path} is no calibration of errors ({error}); deploy again") from error
 
-    def ratios(self, xhat: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """The larger of residual and distance over its scale, at each step; ∞ where a value is not finite.
+    def save(self, path: Path) -> None:
+        """Write it, but for the training states."""
+        write_json(path, self.plain)
+
+    @property
+    def plain(self) -> dict:
+        """Plain containers, as a file and a page have it."""
+        return {
+            "limit": self.limit,
+            "metric": self.metric.tolist(),
+            "reach": self.reach.plain(),
+            "calibration": None if self.calibration is None else self.calibration.plain(),
+            "validated": self.validated.tolist(),
+        }
+
+    @cached_property
+    def _nearest(self) -> cKDTree:
+        rows = self._taught @ self.metric
+        return cKDTree(rows[spaced(len(rows), _NEAREST)])
+
+    def moved(self, xhat: np.ndarray) -> np.ndarray:
+        """[..., N + 1] RMS displacement [m] of latent vectors [..., N + 1, r] from the first."""
+        return np.linalg.norm((xhat - xhat[..., :1, :]) @ self.metric, axis=-1)
+
+    def signal(
+        self, xhat: np.ndarray, members: np.ndarray | None = None, residuals: np.ndarray | None = None
+    ) -> np.ndarray:
+        """What a run says of its error [N + 1] [m]; ∞ where it is lost.
 
         Args:
             xhat: [N + 1, r] latent vectors.
-            residuals: [N] projection residuals after the last iteration [m]; none at t = 0.
-
-        Returns:
-            [N + 1] dimensionless; above 1 the step is not to be believed.
+            members: [M, N + 1, r] of each member of a model, M > 1; None of a single one.
+            residuals: [N + 1] that projections left at S [m].
         """
-        residual = np.concatenate([[0.0], residuals]) / self.residual
-        # Not np.fmax: a value that is not finite must not hide behind the other.
-        ratios = np.maximum(residual, self.latent_distance.of(xhat) / self.distance)
-        return np.nan_to_num(ratios, nan=np.inf, posinf=np.inf)
+        if members is not None:
+            off = (members - members.mean(0)) @ self.metric
+            return _finite(np.sqrt(np.square(off).sum((0, -1)) / (len(members) - 1)))
+        good = np.isfinite(xhat).all(-1)
+        off = np.full(len(xhat), np.inf)
+        off[good] = self._nearest.query(xhat[good] @ self.metric)[0]
+        if residuals is not None:
+            off = np.hypot(off, residuals)
+        return _finite(off)
 
-    def of_forcing(self, gravity: np.ndarray, solids: np.ndarray, dt: float) -> np.ndarray:
-        """How far what forces a run is outside of what programs of training do.
+    def signal_of(self, run: ReducedMPM, first: int = 0) -> np.ndarray:
+        """`signal` of a run from a step up to now."""
+        latent, members = run.trajectory(), run.members
+        residuals = None if run.span.latent_only else np.concatenate([[0.0], latent.residuals[:, -1]])[first:]
+        return self.signal(latent.xhat[first:], None if members is None else members[:, first:], residuals)
 
-        Args:
-            gravity: [..., 3] at the start of each step [m/s²].
-            solids: [..., f] state of the solids there, as `collider_states` gives it; dt: step [s].
-
-        Returns:
-            [...] distance from the middle over the radius or half of the range, where that is above 1; else
-            0, since a forcing that is inside tells nothing of where the run goes.
-        """
-        ratios = np.zeros(gravity.shape[:-1])
-        if self.gravity is not None:
-            middle, radius = self.gravity
-            ratios = np.linalg.norm(gravity - np.asarray(middle), axis=-1) / radius
-        if self.solids is not None:
-            ratios = np.maximum(ratios, self.solids.of(solids, dt))
-        return np.where(ratios > 1.0 + _ROUND_OFF, ratios, 0.0)
-
-    def of_forcing_in(self, run: ReducedMPM, first: int = 0) -> np.ndarray:
-        """`of_forcing` at the steps of a run from a first one on, each with the forcing of its start."""
+    def outside(self, run: ReducedMPM, first: int = 1) -> str:
+        """Why the inputs of a run, in its steps from one on, are outside of what was taught; empty if not."""
         steps, dt = run.steps_taken, run.together.dt
-        colliders = run.together.batch.forcing.colliders_of(run.index)
-        solids = collider_states(colliders, dt, steps)[first:]
-        return self.of_forcing(run.acting_gravity(dt * np.arange(first, steps)), solids, dt)
+        solids = collider_states(run.together.batch.forcing.colliders_of(run.index), dt, steps)[first - 1 :]
+        gravity = run.acting_gravity(dt * np.arange(first - 1, steps))
+        return self.reach.of_inputs(run.setup.values, gravity, solids, dt) if self.reach else ""
 
-    def of_run(self, run: ReducedMPM, diverged: int | None = None) -> np.ndarray:
-        """All signals of a run together, [n + 1] over the steps taken; above 1 a step is not to be believed.
+    def of_run(self, run: ReducedMPM, signal: np.ndarray, diverged: int = -1) -> Verdict:
+        """The verdict on a run, at its end or in its midst.
 
         Args:
-            run: at its end, or in its midst.
-            diverged: step at which it diverged and from which on the ratio is ∞; −1: at none. None: to be
-                found.
+            run: with the forcing that acts on it.
+            signal: [N + 1] of it, from `signal_of`.
+            diverged: step at which it diverged; −1: at none.
         """
-        latent = run.trajectory()
-        ratios = self.ratios(latent.xhat, latent.residuals[:, -1])
-        # Not below 1: there the steps themselves tell more.
-        for outside in (run.doubt[0], self.cases.of(run.setup.values)):
-            if outside > 1.0:
-                ratios = np.maximum(ratios, outside)
-        ratios[1:] = np.maximum(ratios[1:], self.of_forcing_in(run))
-        diverged = run.left_grid() if diverged is None else diverged
+        latent, whole = run.trajectory(), run.steps_taken == run.total_steps
+        path = latent.t, latent.xhat, signal
+        return self.judge(run.setup.values, *path, self.outside(run), diverged, whole)
+
+    def judge(
+        self,
+        values: Mapping[str, float],
+        t: np.ndarray,
+        xhat: np.ndarray,
+        signal: np.ndarray,
+        outside: str = "",
+        diverged: int = -1,
+        whole: bool = True,
+    ) -> Verdict:
+        """The verdict on a run of a case.
+
+        Args:
+            values: its parameters, by name.
+            t: [N + 1] [s]; xhat: [N + 1, r] latent vectors; signal: [N + 1] [m].
+            outside: why its inputs are outside of what was taught; empty where they are not.
+            diverged: step at which it diverged; −1: at none.
+            whole: whether it is at its end; else errors are shares of what validation runs move at least.
+        """
+        lost = diverged if diverged >= 0 else len(t)
+        finite = np.isfinite(xhat).all(-1) & (np.arange(len(t)) < lost)
+        displacement = float(rms(self.moved(np.where(finite[:, None], xhat, xhat[:1]))))
+        beyond, why = bool(outside), outside
+        if self.reach is not None and not beyond:
+            left = np.flatnonzero(self.reach.of_states(xhat[finite] @ self.metric))
+            if beyond := bool(len(left)):
+                why = f"its shape left those of the training runs at t = {t[finite][left[0]]:.3g} s"
         if diverged >= 0:
-            ratios[diverged:] = np.inf
-        return ratios
+            why = why or f"it diverged at t = {t[diverged]:.3g} s"
+        if self.calibration is None:
+            bound = np.full(len(t), np.inf if diverged >= 0 else np.nan)
+            share, why = 1.0, why or self.unknown
+        else:
+            displacement = displacement if whole else max(displacement, self.calibration.displacement)
+            bound = self._away(values) * self.calibration.bound(t, signal, displacement)
+            bound[~finite] = np.inf
+            share = self.calibration.share
+            if not why and not len(self.calibration.errors):
+                why = "every validation run was lost"
+            elif not why and self.calibration.coarse:
+                why = "the bound is coarse, of one validation run"
+        error = np.where(np.isinf(bound), np.inf, bound * share)
+        return Verdict(error, bound, displacement, self.limit, why, beyond)
+
+    def _away(self, values: Mapping[str, float]) -> float:
+        """Factor on a bound: 1 in a validation case, more the further away a case is."""
+        if self.reach is None or not self.validated.size:
+            return 1.0
+        at = np.array([values[name] for name in self.reach.names])
+        width = np.ptp(self.reach.box, axis=1)
+        sides = np.abs(self.validated - at)[:, width > 0.0] / width[width > 0.0]
+        return 1.0 + _AWAY * float(sides.max(1, initial=0.0).min())
+
+    def calibrated(
+        self, reach: Reach, cases: Sequence[Mapping[str, float]], calibration: Calibration
+    ) -> "Trust":
+        """The same with what validation runs of some cases say."""
+        validated = np.array([[case[name] for name in reach.names] for case in cases]).reshape(len(cases), -1)
+        return Trust(self.metric, self._taught, self.limit, reach, calibration, validated)
 
 
-def calibrate(
-    solver_at: Callable[[Mapping[str, float], str], ReducedMPM], manifold, device: str, projects: bool = True
-) -> Trust:
-    """The estimate of trust, from reduced runs of the first, the middle and the last training cases.
-
-    Runs and not the snapshots' own residuals: what a step leaves at S depends on S, the method and Δt.
-
-    Args:
-        solver_at: case and device name → solver at t = 0.
-        manifold: trained fields.
-        device: `cpu`, `cuda` or `cuda:N`.
-        projects: whether projected steps are taken, so that residuals count; else no run is made.
-    """
-    cases, runs = CaseDistance(manifold), []
-    extremes = cases.extremes() if projects else cases.extremes()[:1]
-    with Progress("calibrate", len(extremes), "runs") as progress:
-        for case in extremes:
-            solver = solver_at(case, device)
-            if projects:
-                solver.step(solver.total_steps)
-                latent, diverged = solver.trajectory(), solver.left_grid()
-                good = diverged if diverged >= 0 else len(latent.xhat)
-                runs.append((latent.xhat[:good], latent.residuals[: good - 1, -1]))
-            progress.advance()
-    particles = np.unique(np.concatenate([span.particles for span in solver.samples]))
-    return Trust.calibrated(LatentDistance(manifold, particles, device), cases, runs)
-
-
-def first_distrusted(ratios: np.ndarray) -> int:
-    """First step whose ratio [N + 1] exceeds 1; −1 when none does."""
-    above = np.flatnonzero(ratios > 1.0)
-    return int(above[0]) if len(above) else -1
-
-
-def _nearest(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Distance [n] of each row of a [n, c] to the nearest row of b [m, c]."""
-    return torch.cat([torch.cdist(rows, b).amin(1) for rows in a.split(_ROWS)])
-
-
-def _largest(runs: list[np.ndarray]) -> float:
-    """Largest value of all runs, at most `STRAY` medians of their own largest; never 0, since it divides."""
-    tiny = float(np.finfo(float).tiny)
-    if not runs:
-        return tiny
-    largest = [float(np.max(values, initial=tiny)) for values in runs]
-    return min(max(largest), STRAY * float(np.median(largest)))
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, np.inf)

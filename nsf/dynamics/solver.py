@@ -69,12 +69,6 @@ class ReducedBatch:
         return ReducedBatch([self.batch.setups[index]], self._engine, self.why)
 
     @property
-    def doubts(self) -> tuple[tuple[float, str], ...]:
-        """How far the input of each run lies outside of what its engine learned from; see `Engine.doubt`."""
-        pairs = zip(self.batch.setups, self.batch.forcing.gravities, strict=True)
-        return tuple(self._engine.doubt(setup, gravity) for setup, gravity in pairs)
-
-    @property
     def xhat(self) -> torch.Tensor:
         """[B, r] latent vectors, on the device."""
         return self.batch.record.now
@@ -262,9 +256,10 @@ class ReducedMPM:
         return self.together.engine
 
     @property
-    def doubt(self) -> tuple[float, str]:
-        """How far the run's input lies outside of what its engine learned from; see `Engine.doubt`."""
-        return self.together.doubts[self.index]
+    def members(self) -> np.ndarray | None:
+        """x̂ [M, N + 1, r] of each member of its model up to now, on the host; None of a single one."""
+        members = self.span.members(self.steps_taken)
+        return None if members is None else members[:, self.index].double().cpu().numpy()
 
     @property
     def nbytes(self) -> int:

@@ -77,8 +77,8 @@ class Span(ABC):
         """Take steps at once, where they are `latent_only`."""
         raise NotImplementedError(f"{type(self).__name__} takes its steps one by one")
 
-    def spread(self, steps: int) -> torch.Tensor | None:
-        """How far the members of a model are from their mean at S [B, steps + 1] [m]; None of one member."""
+    def members(self, steps: int) -> torch.Tensor | None:
+        """x̂ [M, B, steps + 1, r] of each member of a model that has several, up to a step; None of others."""
         return None
 
     @property

@@ -7,7 +7,6 @@ from typing import ClassVar
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span
-from nsf.mpm import Gravity
 
 
 class Engine(ABC):
@@ -28,15 +27,3 @@ class Engine(ABC):
     @abstractmethod
     def spans(self, batch: Batch) -> Sequence[Span]:
         """The spans of time that take the steps of runs that are not refused."""
-
-    def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
-        """How far a run's input lies outside of what the engine learned from, in units of its range.
-
-        Args:
-            setup: of the run.
-            gravity: in its course, which a hand may still change.
-
-        Returns:
-            At most 1 where it is inside, and 0 where nothing is learned; and a text of what lies outside.
-        """
-        return 0.0, ""

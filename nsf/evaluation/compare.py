@@ -11,7 +11,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.data.schema import COMPONENTS
-from nsf.deployment import FULL_ORDER, Rollout
+from nsf.deployment import Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
@@ -66,21 +66,13 @@ def _between(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(t, times, column) for column in rows.T], axis=1)
 
 
-def trust_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
-    """Trust [F] at the full-order frame times: that of the first deployment step which has reached them.
+def bound_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
+    """Error bound [F] [m] at the full-order frame times: that of the first step which has reached them.
 
-    NaN after a hand-over, where nothing is estimated.
+    NaN after a hand-over, where there is no error.
     """
     reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
-    return np.where(_of_continuation(rollout, t), np.nan, rollout.trust[reached])
-
-
-def levels_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
-    """Who took the step [F] that reached each frame (`Rollout.by`); NaN at the first, which none did."""
-    reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
-    levels = np.append(rollout.levels, FULL_ORDER)  # a run that was handed over at once has taken no step
-    by = np.where(_of_continuation(rollout, t), FULL_ORDER, levels[np.maximum(reached - 1, 0)])
-    return np.where(reached > 0, by, np.nan)
+    return np.where(_of_continuation(rollout, t), np.nan, rollout.verdict.bound[reached])
 
 
 def _of_continuation(rollout: Rollout, t: np.ndarray) -> np.ndarray:
@@ -282,8 +274,7 @@ def _series(
             "linear_momentum_error": momentum("p"),
             "angular_momentum_error": momentum("L"),
             "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
-            "trust": trust_at_frames(rollout, t),
-            "by": levels_at_frames(rollout, t),
+            "error_bound": bound_at_frames(rollout, t),
             **{f"xhat_{k + 1}": xhat[:, k] for k in range(xhat.shape[1])},
             **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
         }

@@ -259,7 +259,7 @@ class Designed:
         values: [N + 1, k] of the program at the steps.
         xhat: [N + 1, r] of the run by recurrence; seen: [m] the targets in it [m].
         cost: sum of squares of (seen − target)/tolerance; stopped: why the search ended.
-        distrust: of the run.
+        error_bound: of the run, a share of its displacement.
     """
 
     values: np.ndarray
@@ -267,7 +267,7 @@ class Designed:
     seen: np.ndarray
     cost: float
     stopped: str
-    distrust: float
+    error_bound: float
 
 
 def design(program: Program, view: View, parameters, seed: int = 0) -> Designed:
@@ -300,8 +300,8 @@ def design(program: Program, view: View, parameters, seed: int = 0) -> Designed:
         xhat, forcing = run(u)
         seen = view.of_runs(xhat)[0].cpu().numpy()
         values = program.values(u.unflatten(-1, shape))[0].cpu().numpy()
-        distrust = float(model.distrust(xhat, mu.expand(1, -1), forcing)[0])
-    return Designed(values, xhat[0].cpu().numpy(), seen, 2.0 * end.cost, str(end.message), distrust)
+        error_bound = float(model.error_bound(mu.expand(1, -1), forcing)[0])
+    return Designed(values, xhat[0].cpu().numpy(), seen, 2.0 * end.cost, str(end.message), error_bound)
 
 
 class Held:

@@ -48,7 +48,8 @@ class Fit:
         scale: [m] s [m].
         share: [n] of the variance that is the model's own error.
         freedom: [n] degrees of freedom of the intervals.
-        xhat: [N + 1, r] the fitted run; distrust: its ratio.
+        xhat: [N + 1, r] the fitted run; error_bound: of it, a share of its displacement; limit: above
+            which it is not to be believed.
         project: [n, m] A/s, from observations [m] to u.
         seconds: wall time.
     """
@@ -67,7 +68,8 @@ class Fit:
     share: np.ndarray
     freedom: np.ndarray
     xhat: np.ndarray
-    distrust: float
+    error_bound: float
+    limit: float
     project: np.ndarray
     seconds: float
 
@@ -143,7 +145,7 @@ def fit(
     with torch.no_grad():
         mu = space.parameters(torch.as_tensor(best.x, device=model.device))
         xhat = model(mu, forcing)
-        distrust = float(model.distrust(xhat, mu, forcing))
+        error_bound = float(model.error_bound(mu, forcing))
 
     def valued(u: np.ndarray) -> np.ndarray:
         return space.values(torch.as_tensor(u)).numpy()
@@ -164,7 +166,8 @@ def fit(
         share=share,
         freedom=freedom,
         xhat=xhat.cpu().numpy(),
-        distrust=distrust,
+        error_bound=error_bound,
+        limit=model.trust.limit,
         project=A / s,
         seconds=time.perf_counter() - began,
     )

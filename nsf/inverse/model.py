@@ -10,20 +10,15 @@ import torch
 from torch import Tensor
 
 from nsf.data import PROGRAM
-from nsf.deployment import Trust
+from nsf.deployment import TRUST, Trust
 from nsf.errors import ConfigError, ShapeError
 from nsf.inverse.inputs import Polynomial
-from nsf.inverse.recurrence import differentiable_run
+from nsf.inverse.recurrence import differentiable_run, member_runs
 from nsf.kinematics.manifold import Restriction
 from nsf.models import Recurrence
 from nsf.pipeline import Pipeline
-from nsf.pipeline.stages.deployment import trust_of
 from nsf.recurrence import RecurrenceEngine, collider_states, first_change
 from nsf.runs import Run
-
-#: Frames of a run at which it is asked how far it is from the training runs.
-_LOOKS = 25
-_NEAR = 0.02  # of the scale of distances, by which one may be off
 
 
 @dataclass(frozen=True)
@@ -79,7 +74,6 @@ class Model:
         self.ranges = np.array(self.recurrence.taught.ranges)
         self.dt, self.t = one.dt, one.dt * np.arange(one.total_steps + 1)
         self.spacing = float(one.constants.volume0.mean() ** (1 / 3))
-        self._every = np.unique(np.concatenate([sets.sample for sets in one.sets]))
         self._form = self.recurrence.form.to(self.device)
         self._xhat = one.xhat.to(self.device, torch.float64)
         self._given: dict[str, Polynomial] = {}
@@ -125,15 +119,18 @@ class Model:
         """
         mu = self.tensor(parameters)
         rows = mu.reshape(-1, mu.shape[-1])
+        run = differentiable_run(self._form, *self._start_and_forcing(rows, forcing))
+        return run.movedim(0, -2).unflatten(0, mu.shape[:-1]) if mu.ndim > 1 else run[:, 0]
+
+    def _start_and_forcing(self, rows: Tensor, forcing: Forcing | None) -> tuple[Tensor, ...]:
+        """x̂_0, d_0, parameters, gravity and solids of runs at parameters [B, n], as a run takes them."""
         first = self._of("start", rows).expand(len(rows), -1).clone()
         acting = forcing or Forcing(self._of("gravity", rows), self._of("solids", rows))
         gravity, solids = (
             values.to(self.device).flatten(0, -3).movedim(-2, 0) if values.ndim > 2 else values[:, None]
             for values in (acting.gravity, acting.solids)
         )
-        xhat = self._xhat.repeat(len(rows), 1)
-        run = differentiable_run(self._form, xhat, first, rows, gravity, solids)
-        return run.movedim(0, -2).unflatten(0, mu.shape[:-1]) if mu.ndim > 1 else run[:, 0]
+        return self._xhat.repeat(len(rows), 1), first, rows, gravity, solids
 
     def at(self, points) -> Restriction:
         """The fields at particles [n] or rest positions [n, 3] [m], for many calls of `positions`."""
@@ -180,51 +177,37 @@ class Model:
         parts = (torch.as_tensor(self._inputs(mu, program)[name]) for name in ("gravity", "solids"))
         return Forcing(*(values.to(self.device) for values in parts))
 
-    def distrust(self, xhat: Tensor, parameters, forcing: Forcing | None = None) -> Tensor:
-        """[...] how far runs are from what was taught; above 1 a run is not to be believed.
+    def error_bound(self, parameters, forcing: Forcing | None = None) -> np.ndarray:
+        """[...] bound of the displacement error of runs, a share of the displacement.
 
-        The largest along a run of the distance of its shape from the training runs, in units of theirs from
-        each other; and, above 1, how far parameters, gravity and solids are outside. It takes no projected
-        step, so it does not see how far the recurrence is from one (docs/method.md, Trust).
+        ∞ of a run that is lost or left what was taught; NaN where no validation run tells (docs/method.md).
 
         Args:
-            xhat: [..., N + 1, r], as this model gave them.
-            parameters, forcing: with which.
+            parameters, forcing: as for a call.
         """
         mu = self.tensor(parameters).detach()
-        lead, N = mu.shape[:-1], xhat.shape[-2] - 1
-        looks = torch.linspace(0, N, min(N + 1, _LOOKS + 1)).round().long().to(xhat.device)
-        rows = xhat.detach().expand(*lead, *xhat.shape[-2:])[..., looks, :].flatten(0, -2)
-        off = self._distance(torch.nan_to_num(rows, 0.0, 0.0, 0.0)) / self.trust.distance
-        off = torch.where(torch.isfinite(rows).all(-1), off, torch.inf).view(*lead, len(looks)).amax(-1)
-        outside = torch.tensor([self._outside(case) for case in mu.reshape(-1, len(self.names)).tolist()])
-        off = torch.maximum(off, outside.view(lead).to(off))
-        if forcing is not None:
-            off = torch.maximum(off, torch.as_tensor(self._forced(forcing)).to(off))
-        return off
+        rows = mu.reshape(-1, mu.shape[-1])
+        with torch.no_grad():
+            path = member_runs(self._form, *self._start_and_forcing(rows, forcing))  # [n, M, B, r]
+        acting = forcing or Forcing(self._of("gravity", rows), self._of("solids", rows))
+        gravity, solids = (
+            values.detach().cpu().expand(len(rows), *values.shape[-2:]).numpy()
+            for values in (acting.gravity, acting.solids)
+        )
+        members, t = path.permute(2, 1, 0, 3).cpu().numpy(), self.t[:: self._form.stride]
+        bounds = []
+        for values, paths, *forced in zip(rows.tolist(), members, gravity, solids, strict=True):
+            case, xhat = dict(zip(self.names, values, strict=True)), paths.mean(0)
+            signal = self.trust.signal(xhat, paths if len(paths) > 1 else None)
+            outside = self.trust.reach.of_inputs(case, *forced, self.dt)
+            verdict = self.trust.judge(case, t, xhat, signal, outside)
+            bounds.append(np.inf if verdict.beyond else verdict.bound_share)
+        return np.reshape(bounds, mu.shape[:-1])
 
     @cached_property
     def trust(self) -> Trust:
-        """The estimate of trust, with the scales that the deployment calibrated."""
-        return trust_of(self.run, self.manifold, self._every, self.pipeline)
-
-    @cached_property
-    def _distance(self):
-        return self.trust.latent_distance.nearly(_NEAR * self.trust.distance)
-
-    def _outside(self, values: Sequence[float]) -> float:
-        """How far parameters are outside of what was taught, or from the training cases; 0 up to 1."""
-        case, taught = dict(zip(self.names, values, strict=True)), self.recurrence.taught
-        ratio = max(taught.outside(case, np.array(taught.gravity))[0], self.trust.cases.of(case))
-        return ratio if ratio > 1.0 else 0.0
-
-    def _forced(self, forcing: Forcing) -> np.ndarray:
-        """[] or [B] how far gravity and solids are outside of what was taught; 0 up to 1."""
-        gravity, solids = (v.detach().cpu().numpy() for v in (forcing.gravity, forcing.solids))
-        taught = self.recurrence.taught
-        far = np.linalg.norm(gravity - taught.gravity, axis=-1).max(-1) / max(taught.reach, 1e-30)
-        programs = self.trust.of_forcing(gravity, solids, self.dt).max(-1)
-        return np.maximum(np.where(far > 1.0 + 1e-6, far, 0.0), programs)
+        """What bounds the errors of its runs, as its deployment calibrated it."""
+        return Trust.open(self.run.file(TRUST), self.manifold)
 
     def _of(self, name: str, mu: Tensor) -> Tensor:
         """The start of runs, or their forcing, at parameters."""

@@ -53,6 +53,13 @@ def differentiable_run(
     return between(nodes.movedim(0, -2), change, form.stride).movedim(-2, 0)
 
 
+def member_runs(
+    form: Form, xhat: Tensor, change: Tensor, mu: Tensor, gravity: Tensor, solids: Tensor
+) -> Tensor:
+    """Latent vectors [N + 1, M, B, r] of each member at strides; arguments as for `differentiable_run`."""
+    return _run(form, xhat, change, mu, *(of_strides(values, form.stride) for values in (gravity, solids)))[0]
+
+
 class _Run(torch.autograd.Function):
     """x̂ [N + 1, M, B, r] of each member at every stride."""
 

@@ -165,13 +165,15 @@ class Runs:
     """Runs at many parameters.
 
     Attributes:
-        parameters: [B, n]; values: [B, scalars, F] [m]; distrust: [B]; t: [F] [s]; names: of the scalars.
+        parameters: [B, n]; values: [B, scalars, F] [m]; t: [F] [s]; names: of the scalars.
+        error_bound: [B] shares of the displacement; limit: above which a run is not to be believed.
         seconds: wall time.
     """
 
     parameters: np.ndarray
     values: np.ndarray
-    distrust: np.ndarray
+    error_bound: np.ndarray
+    limit: float
     t: np.ndarray
     names: tuple[str, ...]
     seconds: float
@@ -179,7 +181,7 @@ class Runs:
     @property
     def trusted(self) -> np.ndarray:
         """[B] whether a run is to be believed."""
-        return (self.distrust <= 1.0) & np.isfinite(self.values).all((1, 2))
+        return ~(self.error_bound > self.limit) & np.isfinite(self.values).all((1, 2))
 
     def quantiles(self, levels: Sequence[float] = LEVELS) -> dict[str, np.ndarray]:
         """[levels, F] of trusted runs, by name.
@@ -195,14 +197,14 @@ class Runs:
 
 def runs(model: Model, parameters: np.ndarray, scalars: Scalars, forcing: Forcing | None = None) -> Runs:
     """Runs at parameters [B, n], in batches."""
-    began, values, distrust = time.perf_counter(), [], []
+    began, values, bounds = time.perf_counter(), [], []
     with torch.no_grad():
         for part in np.array_split(parameters, max(1, -(-len(parameters) // _BATCH))):
             mu = model.tensor(part)
             xhat = model(mu, forcing)
             values.append(scalars.of(xhat).cpu().numpy())
-            distrust.append(model.distrust(xhat, mu, forcing).cpu().numpy())
-    every = np.concatenate(values), np.concatenate(distrust)
+            bounds.append(model.error_bound(mu, forcing))
+    every = np.concatenate(values), np.concatenate(bounds), model.trust.limit
     return Runs(parameters, *every, scalars.t, scalars.names, time.perf_counter() - began)
 
 

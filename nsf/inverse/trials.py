@@ -17,7 +17,8 @@ from nsf.scenes.designs import random_cases
 
 #: Columns of results.csv.
 COLUMNS = (
-    "scene", "parameter", "trial", "truth", "estimate", "standard_error", "inside_90", "seconds", "distrust",
+    "scene", "parameter", "trial", "truth", "estimate", "standard_error", "inside_90", "seconds",
+    "error_bound",
 )  # fmt: skip
 _SEED = 100  # of the cases, apart from those that teach a recurrence
 
@@ -82,7 +83,7 @@ def run(model: Model, trials: Trials, say: Callable[[str], object] = print) -> t
         for k, name in enumerate(best.space.free):
             inside = best.lower[k] <= case[name] <= best.upper[k]
             values = case[name], best.estimate[k], best.standard_error[k], int(inside), seconds
-            rows.append([model.scene.name, name, trial, *values, best.distrust])
+            rows.append([model.scene.name, name, trial, *values, best.error_bound])
         text = ", ".join(
             f"{name} {best.estimate[k]:.4g} ± {best.standard_error[k]:.2g} for {case[name]:.4g}"
             for k, name in enumerate(best.space.free)

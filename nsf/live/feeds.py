@@ -33,14 +33,15 @@ class LatentFeed:
         self.field = field_message(model)
 
     def frame(self, moment: Moment) -> bytes:
-        """t [s], the distrust ratio and x̂, [2 + r] float32, little-endian."""
-        return np.concatenate([[moment.t, moment.trust], moment.xhat]).astype("<f4").tobytes()
+        """t [s], the expected error and its bound as shares of the displacement, and x̂: [3 + r] float32."""
+        errors = moment.verdict.error_share, moment.verdict.bound_share
+        return np.concatenate([[moment.t, *errors], moment.xhat]).astype("<f4").tobytes()
 
     def state(self, moment: Moment, player: Player) -> dict:
-        """The values of the parameters, how far they are from training, whether the run diverged or plays."""
-        run = moment.run
-        values = list(run.case.parameters.values())
-        return {"values": values, "away": run.away, "diverged": run.diverged, "playing": player.playing}
+        """The values of the parameters, whether to believe the run and why not, and whether it plays."""
+        values, verdict = list(moment.run.case.parameters.values()), moment.verdict
+        light = {"flag": verdict.flag, "reason": verdict.reason}
+        return {"values": values, "light": light, "playing": player.playing}
 
     def begin_again(self) -> None:
         """Forget what clients asked for of the picture."""
@@ -96,8 +97,9 @@ class PointFeed(LatentFeed):
         self.field = page.packed(header, {"rest": model.X})
 
     def frame(self, moment: Moment) -> bytes:
-        """Positions [n, 3] [m] and shades [n] of both runs, the particles' sets, and of the moment t [s], the
-        distrust ratio, the step, and latent steps a second; as `nsf.live.page.packed` has them.
+        """Positions [n, 3] [m] and shades [n] of both runs, the sets of particles, of the moment t [s], the
+        expected error and its bound as shares of the displacement, the step, and latent steps a second; as
+        `nsf.live.page.packed` has them.
         """
         run, step = moment.run, moment.step
         key = (run, step, run.finished, self.color)
@@ -106,8 +108,9 @@ class PointFeed(LatentFeed):
         truth = self.truth(moment)
         shade, full = self._coloring.shades(moment, truth, self.color)
         rate = run.reached / run.seconds if run.seconds else 0.0
+        errors = moment.verdict.error_share, moment.verdict.bound_share
         arrays = {
-            "moment": np.array([moment.t, moment.trust, step, rate], np.float32),
+            "moment": np.array([moment.t, *errors, step, rate], np.float32),
             "x": run.positions(step), "shade": shade,
             "roles": self._model.roles(step).astype(np.uint8),
         }  # fmt: skip

@@ -10,14 +10,13 @@ import torch
 
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY, packed
-from nsf.deployment import Trust
+from nsf.deployment import TRUST, Trust, Verdict
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
 from nsf.live import page
 from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
-from nsf.pipeline.stages.deployment import trust_of
 from nsf.runs import Run
 from nsf.scenes.programs import tilted
 
@@ -93,14 +92,13 @@ class LiveRun:
         case: its problem parameters.
         solver: reduced solver at t = 0.
         decoder: the solver's fields at the particles that are shown.
-        trust: estimates whether to believe the run.
+        trust: bounds the error of the run.
 
     Attributes:
         steps, dt: number of steps of the whole run, and their length [s].
         reached: last step that can be read.
         finished: whether the run has reached the scene's end or has diverged.
         by_hand: whether a hand has changed gravity in its course.
-        away: how far the case is from the training cases, in units of their spacing.
         diverged: whether the run ended early, with x̂ not finite or a sample particle off the grid.
         seconds: wall time of the steps [s].
     """
@@ -108,14 +106,16 @@ class LiveRun:
     def __init__(self, case: Case, solver: ReducedMPM, decoder: Decoder, trust: Trust):
         self.by_hand = False
         self.case, self.steps, self.dt = case, solver.total_steps, solver.dt
-        self.away = trust.cases.of(case)
         self._solver: ReducedMPM | None = solver
         self._decoder, self._trust = decoder, trust
         self._xhat = np.zeros((self.steps + 1, solver.manifold.latent_dim), np.float32)
         self._shat: np.ndarray | None = None
-        self._ratios = np.zeros(self.steps + 1)
+        self._signal = np.zeros(self.steps + 1)
+        self._outside: tuple[int, str] = (
+            self.steps + 1,
+            "",
+        )  # step, and why the inputs are outside from there
         self._xhat[0] = solver.state.xhat
-        self._ratios[0] = trust.ratios(self._xhat[:1], np.zeros(0))[0]
         self.reached, self.seconds, self.diverged = 0, 0.0, False
 
     @property
@@ -139,10 +139,10 @@ class LiveRun:
             if self._shat is None:
                 self._shat = np.zeros((self.steps + 1, latent.stress.shape[1]), np.float32)
             self._shat[block] = latent.stress[block]
-        residuals = latent.residuals[first - 1 : last, -1]
-        ratios = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
-        forced = self._trust.of_forcing_in(solver, first - 1)[: last - first + 1]
-        self._ratios[block] = np.maximum(ratios, forced)
+        self._signal[block] = self._trust.signal_of(solver, first)[: last - first + 1]
+        why = self._trust.outside(solver, first)
+        if why and not self._outside[1]:
+            self._outside = first, why
         self.seconds += time.perf_counter() - started
         self.diverged = lost >= 0
         self.reached = last  # only now, since other threads read all steps up to here
@@ -163,7 +163,7 @@ class LiveRun:
         """
         solver, kept = self._solver, slice(0, step + 1)
         assert solver is not None, "the run has begun"
-        self._xhat[kept], self._ratios[kept] = run._xhat[kept], run._ratios[kept]
+        self._xhat[kept], self._signal[kept] = run._xhat[kept], run._signal[kept]
         self._shat = None if run._shat is None else run._shat.copy()
         self.reached, self.by_hand = step, True
         record = solver.record
@@ -178,11 +178,13 @@ class LiveRun:
         """[r] float32 latent vector."""
         return self._xhat[step]
 
-    def trust(self, step: int) -> float:
-        """Largest distrust ratio up to the step; ∞ at the end of a run that diverged."""
-        if self.diverged and step >= self.reached:
-            return math.inf
-        return float(self._ratios[: step + 1].max())
+    def verdict(self, step: int) -> Verdict:
+        """The bound of the error up to the step; ∞ at the end of a run that diverged."""
+        shown, (first, why) = slice(0, step + 1), self._outside
+        diverged = step if self.diverged and step >= self.reached else -1
+        t, whole = self.dt * np.arange(step + 1), step == self.steps
+        run = t, self._xhat[shown].astype(float), self._signal[shown]
+        return self._trust.judge(self.case, *run, why if step >= first else "", diverged, whole)
 
     def positions(self, step: int) -> np.ndarray:
         """[n, 3] m, float32."""
@@ -233,7 +235,7 @@ class LiveModel:
         solver = self.pipeline.solver_at(self.manifold, self.initial)
         sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
         self._sets_at = solver.sets_at
-        self.trust = trust_of(run, self.manifold, sample, self.pipeline)
+        self.trust = Trust.open(run.file(TRUST), self.manifold)
         self.particles = len(self.manifold.X)
         self.sample = sample
         self.shown = _shown(self.manifold.X.numpy(), sample, points, surface)
@@ -275,11 +277,10 @@ class LiveModel:
     @property
     def tilt(self) -> float | None:
         """Largest tilt of gravity that programs of training may give [rad]; None where they give none."""
-        if self.trust.gravity is None:
+        taught, size = self.trust.reach, float(np.linalg.norm(self.trust.reach.gravity))
+        if not self.pipeline.scene.forcing.gravity or not size:
             return None
-        middle, reach = self.trust.gravity
-        size = float(np.linalg.norm(middle))
-        return float(2.0 * np.arcsin(min(1.0, 0.5 * reach / size))) if size else None
+        return float(2.0 * np.arcsin(min(1.0, 0.5 * taught.radius / size)))
 
     def tilted(self, run: LiveRun, step: int, tilt: Sequence[float]) -> LiveRun:
         """A run that goes on from a step of another under gravity that a hand has tilted.

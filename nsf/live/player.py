@@ -5,10 +5,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from nsf.data import Case
+from nsf.deployment import Verdict
 from nsf.errors import first_line
 from nsf.live.model import LiveModel, LiveRun
 
@@ -46,10 +48,10 @@ class Moment:
         """[r] float32 latent vector."""
         return self.run.xhat(self.step)
 
-    @property
-    def trust(self) -> float:
-        """Largest distrust ratio up to the step."""
-        return self.run.trust(self.step)
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The bound of the error up to the step."""
+        return self.run.verdict(self.step)
 
 
 class Player:

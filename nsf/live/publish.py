@@ -1,7 +1,6 @@
 """A model that runs in a page: what a file of it holds, and what cannot be put into one."""
 
 import itertools
-import math
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ from nsf.bodies.colors import CLIP
 from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.data.trajectory import Trajectory
-from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError
 from nsf.evaluation.metrics import von_mises
 from nsf.live import page
@@ -32,8 +30,6 @@ from nsf.vectors import spaced
 POINTS = 20_000
 #: Largest page [bytes], which still goes by mail.
 LARGEST = 16_000_000
-_TUBE = 0.01  # of the scale of distances, by which a page may be off
-_SNAPSHOTS = 6000  # training snapshots that distances are taken to
 _SAME = 1e-9
 
 
@@ -106,7 +102,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
         "recurrence": recurrence_header(recurrence.form),
         "start": _start(model, recurrence.form.stride),
         "gravity": _tilt(model, recurrence),
-        "trust": _trust(model, recurrence, arrays),
+        "trust": model.trust.plain,
         "recordings": {},
     }  # fmt: skip
     header["cases"] = _cases(model, taught.parameters, arrays, header, sizes)
@@ -223,36 +219,16 @@ def _tilt(model: LiveModel, recurrence: RecurrenceEngine) -> dict | None:
     return {"down": down.tolist(), "angle": float(2.0 * np.arcsin(min(1.0, 0.5 * reach / size)))}
 
 
-def _trust(model: LiveModel, recurrence: RecurrenceEngine, arrays: dict) -> dict:
-    """Put the distances to the training runs into a page."""
-    trust, taught = model.trust, recurrence.taught
-    matrix, latents = trust.latent_distance.embedded(_TUBE * trust.distance)
-    matrix = matrix[:, : len(arrays["deformation.scale"])]  # modes that were left out move little
-    latents = latents[:: -(-len(latents) // _SNAPSHOTS)]
-    scale = np.maximum(np.abs(latents).max(0), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
-    arrays |= {
-        "tube.matrix": matrix,
-        "tube.scale": scale,
-        "tube.known": np.rint(latents / scale).astype(np.int16),
-    }
-    gravity = (
-        {"middle": list(taught.gravity), "reach": taught.reach} if recurrence.form.sizes.gravity else None
-    )
-    return {"distance": trust.distance, "cases": trust.cases.plain(), "gravity": gravity}
-
-
 def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) -> list[dict]:
     """The held-out cases: their parameters, forcing, and the full-order runs of some."""
     pipeline, entries, movable = model.pipeline, [], _movable(model)
     for index, case in enumerate(pipeline.held_out):
         scene = pipeline.deployed.at(case)
-        rollout = Rollout.open(model.run.file(rollout_file(index)), model.manifold.latent_dim)
         entry = {
             "label": str(case).replace("_", " "),
             "values": [case[name] for name in names],
             "gravity": _gravity(scene),
             "solids": [solid | {"movable": movable.get(solid["name"])} for solid in model.solids(case)],
-            "estimate": None if math.isnan(off := rollout.estimated_error) else float(np.nan_to_num(off)),
             "recording": None,
         }  # fmt: skip
         if case in model.simulated and len(header["recordings"]) < sizes.runs:

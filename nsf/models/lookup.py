@@ -13,7 +13,6 @@ from nsf.dynamics.span import Span, Stages
 from nsf.engines.base import Engine
 from nsf.models.base import Model
 from nsf.models.inputs import Inputs, Lessons
-from nsf.mpm import Gravity
 from nsf.recurrence.engine import first_change
 from nsf.recurrence.solids import collider_states
 
@@ -92,12 +91,6 @@ class LatentEngine(Engine):
         like = {"dtype": one.dtype, "device": one.torch_device}
         at = [one.manifold.restrict(sets.sample, **like) for sets in one.sets]
         return [LatentSpan(batch, sets, sample, table) for sets, sample in zip(one.sets, at, strict=True)]
-
-    @override
-    def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
-        if self.model.knows_forcing or np.array_equal(gravity.values, setup.gravity.values):
-            return 0.0, ""
-        return np.inf, f"gravity is another than in training, and model={self.name} knows no forcing"
 
 
 class _Table:

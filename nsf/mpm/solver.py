@@ -23,7 +23,6 @@ from nsf.mpm.precision import Precision, precision_of
 from nsf.mpm.stability import MAX_ELASTIC_CFL, check_time_step, wave_speed_at
 from nsf.mpm.state import ParticleState, cell_order
 from nsf.mpm.step import GridStep
-from nsf.mpm.stressed import stressed
 from nsf.mpm.transfer.g2p import make_g2p_stress
 from nsf.mpm.transfer.scheme import Transfer
 from nsf.mpm.watch import Watch
@@ -114,7 +113,6 @@ class FullOrderMPM:
         names: of the colliders, for `forcing`.
 
     Attributes:
-        beyond_law: particles whose stress `resume` had to scale down.
 
     Raises:
         InstabilityError: Δt is unstable, or a collider too fast; the message names the largest stable Δt.
@@ -149,7 +147,7 @@ class FullOrderMPM:
         self.precision = precision_of(precision)
         self.device = warp_device(device)
         self.check_every = check_every
-        self.steps_taken = self.beyond_law = 0
+        self.steps_taken = 0
         x = constants.X if x is None else np.asarray(x, np.float64)
         v = np.zeros_like(constants.X) if v is None else np.asarray(v, np.float64)
         if x.shape != constants.X.shape or v.shape != constants.X.shape:
@@ -210,38 +208,8 @@ class FullOrderMPM:
         self.state.unload()
         self.forcing.release()
         self.grid_step.forcing.start_from(0)
-        self.steps_taken = self.beyond_law = 0
+        self.steps_taken = 0
         self._watch.restart()
-
-    def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
-        """Continue from a state that is given by its positions, velocities and stresses alone.
-
-        F_e becomes the stretch that carries τ (`Material.stretch_of`), and the history variables those that
-        the law assumes for τ (`Material.history_of`). The colliders go to their pose at that time. A stress
-        beyond the law is scaled down to the largest one that the law carries; `beyond_law` counts such
-        particles.
-
-        Args:
-            steps: time of the state in steps of Δt.
-            x, v: [P, 3] position [m] and velocity [m/s].
-            C: [P, 3, 3] affine momentum [1/s].
-            tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
-
-        Raises:
-            InstabilityError: Δt is too long for v, or a particle is non-finite or off the grid.
-        """
-        check_time_step(self.constants, v, self.grid.geometry.dx, self.dt)
-        tau = np.asarray(tau, np.float64)
-        if not np.isfinite(tau).all():
-            raise InstabilityError(f"the stress to resume from at step {steps} is not finite")
-        carried, self.beyond_law = stressed(self.material, tau, self.constants.mu, self.constants.lam)
-        state = {"x": x, "v": v, "C": C} | carried
-        for name, values in state.items():
-            getattr(self.state, name).assign(values)
-        self.grid_step.forcing.start_from(steps)
-        self.steps_taken = steps
-        self._watch.restart(unstressed=False)
-        self.check()
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.

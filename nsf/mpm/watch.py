@@ -189,9 +189,9 @@ class Watch:
         """Bytes on the device."""
         return sum(a.capacity for a in (self._first, self._sums, self._fastest))
 
-    def restart(self, unstressed: bool = True) -> None:
-        """Begin anew with the next look; `unstressed`: no energy is stored elastically at its moment."""
-        self._unstressed, self._energy, self._inside, self._kinetic = unstressed, None, 0.0, 0.0
+    def restart(self) -> None:
+        """Begin anew with the next look, at whose moment no energy is stored elastically."""
+        self._unstressed, self._energy, self._inside, self._kinetic = True, None, 0.0, 0.0
         self._worst: dict[str, tuple[float, str]] = {}
 
     def look(self, state, mass: wp.array, grid, forcing: Forcing, dt: float) -> Look:

@@ -9,17 +9,19 @@ a chain whose results are all there, takes a second or two.
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.data.case import Case
 from nsf.errors import MissingRunError
 from nsf.models import Auto, Model
 from nsf.models.drawn import Drawn
+from nsf.paths import option
 from nsf.pipeline import naming
 from nsf.pipeline.configured import Configured
 from nsf.results.folder import check_place
@@ -119,9 +121,37 @@ class Pipeline(Configured):
 
     def alone(self, name: str) -> "Pipeline":
         """The chain of a candidate of `model=auto` by itself, deployed at the validation cases."""
+        return self._with(self.template.model.of[name], split="validation")
+
+    @cached_property
+    def validating(self) -> "Pipeline | None":
+        """The chain that deploys the same model at validation cases, whose runs tell how large errors are.
+
+        None where there are no such cases, or these are deployed anyway.
+        """
+        if not self.split.validation or self.config.deploy.split == "validation":
+            return None
+        if isinstance(self.configured, Auto):
+            return self.alone(self.model.name)
+        return self._with(self.template.model, split="validation", changes=None)
+
+    @property
+    def calibrating(self) -> "list[Pipeline]":
+        """The chains whose deployments bound the errors of this one's runs, and of those by its fallback."""
+        own = [] if isinstance(self.configured, Auto) else [self.validating]
+        taking = [self.projected.validating] if self.config.fallback == "projected" else []
+        return [other for other in own + taking if other is not None]
+
+    @cached_property
+    def projected(self) -> "Pipeline":
+        """The chain of the projected model, which takes runs of another that is not believed."""
+        return self._with(OmegaConf.load(option("model", "projected")))
+
+    def _with(self, model: DictConfig, **deploy: Any) -> "Pipeline":
+        """The chain of another model without fallback, and other keys of `deploy`."""
         config = self.template.copy()
-        config.model = config.model.of[name]
-        config.deploy.split, config.fallback = "validation", "none"
+        config.model, config.fallback = model, "none"
+        config.deploy = OmegaConf.merge(config.deploy, deploy)
         return Pipeline(config, self.say, self.root)
 
     @property
@@ -301,6 +331,10 @@ class Pipeline(Configured):
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
         if self.is_taught and not self.taught.complete:
             self.teach()
+        if not self.deployment.complete:
+            for other in self.calibrating:
+                other.deploy()
+                self._samples, self._sets = other._samples, other._sets
         return self._made(self.deployment, "deployment.deploy_held_out")
 
     def evaluate(self) -> Run:

@@ -43,13 +43,24 @@ def training(pipeline) -> Run:
 def deployment(pipeline) -> Run:
     """The run of the reduced trajectories."""
     deploy, cases = pipeline.config.deploy, pipeline.held_out
-    keys = ("model", "stress", "affine", "fallback", "sampler", "projector", "integration", "precision")
+    keys = (
+        "model",
+        "stress",
+        "affine",
+        "fallback",
+        "trust",
+        "sampler",
+        "projector",
+        "integration",
+        "precision",
+    )
     content = _content(pipeline, *keys) | _physics(pipeline.config.scale, pipeline.deployed, cases[0])
     content |= {"cases": list(map(dict, cases)), "split": deploy.split, "device": pipeline.device}
     content |= {"dt_multiplier": deploy.dt_multiplier}
     if _of_networks(pipeline):
         content["arithmetic"] = pipeline.field.arithmetic
     parents = [pipeline.training, pipeline.taught] if pipeline.is_taught else [pipeline.training]
+    parents += [other.deployment for other in pipeline.calibrating]
     return _run(pipeline, "deploy", content | _edited(), parents)
 
 

@@ -13,13 +13,15 @@ from nsf.models.base import FALLBACKS
 #: Keys that hold others, none of which is left out.
 _SECTIONS = (
     *("material", "transfer", "field", "trainer", "model", "sampler", "projector", "integration"),
-    *("data", "deploy", "evaluation", "super_resolution", "report"),
+    *("data", "deploy", "trust", "evaluation", "super_resolution", "report"),
 )
 #: Types of stored frames.
 STORED = ("float32", "float64")
 PRECISIONS = ("fp32", "fp64")
 #: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
 _LEAST_STEP = 1e-3
+#: Least share of the displacement that may be asked for [%].
+_LEAST_LIMIT = 1e-3
 
 
 def check_values(c: DictConfig) -> None:
@@ -37,6 +39,7 @@ def check_values(c: DictConfig) -> None:
     for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
         configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
     configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
+    configuration.number("trust.limit", c.trust.limit, least=_LEAST_LIMIT)
     configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
     configuration.number("data.every", c.data.every, least=1, whole=True)
     one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))

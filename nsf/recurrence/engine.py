@@ -13,7 +13,6 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span, Stages
 from nsf.engines.base import Engine
-from nsf.mpm import Gravity
 from nsf.recurrence import taught as files
 from nsf.recurrence.descent import of_strides
 from nsf.recurrence.fitting import check_stride
@@ -22,8 +21,6 @@ from nsf.recurrence.loop import Loop
 from nsf.recurrence.solids import collider_states
 from nsf.recurrence.taught import Taught
 from nsf.scenes.identity import physics_hash
-
-_ROWS = 512  # latent vectors decoded at once
 
 
 class RecurrenceEngine(Engine):
@@ -68,10 +65,6 @@ class RecurrenceEngine(Engine):
         at = [one.manifold.restrict(sets.sample, **like) for sets in one.sets]
         runs = Runs(self.form, batch)
         return [RecurrenceSpan(batch, sets, sample, runs) for sets, sample in zip(one.sets, at, strict=True)]
-
-    @override
-    def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
-        return self.taught.outside(setup.values, np.asarray(gravity.values))
 
 
 def first_change(manifold, X: np.ndarray, velocity: np.ndarray, dt: float) -> Tensor:
@@ -193,29 +186,12 @@ class Runs:
         record.now.copy_(record.xhat[:, end])
         record.row.fill_(end)
 
-    def spread(self, at, steps: int) -> Tensor | None:
-        """RMS distance of the members from their mean [B, steps + 1] [m]; ∞ where one is lost.
-
-        Args:
-            at: the fields at particles.
-            steps: of the run.
-
-        Returns:
-            Deviation over members, linear between strides; None where there is one.
-        """
-        members, k = self._form.sizes.members, self._form.stride
-        if members == 1:
+    def members(self, steps: int) -> Tensor | None:
+        """x̂ [M, B, steps + 1, r] of each member, linear between strides; None where there is one."""
+        k = self._form.stride
+        if self._form.sizes.members == 1:
             return None
-        nodes = self.loop.xhat[:, :, : -(-steps // k) + 1]
-        M, B, n, r = nodes.shape
-        deviation = nodes.new_zeros(B, n, dtype=torch.float64)
-        for rows in torch.arange(n).split(max(1, _ROWS // (M * B))):
-            part = nodes[:, :, rows].to(at.dtype).reshape(-1, r)
-            x = at.position(part).double().unflatten(0, (M, B, len(rows)))
-            off = (x - x.mean(0)).square().sum((0, -1)).mean(-1) / (M - 1)
-            deviation[:, rows] = off.sqrt()
-        deviation = torch.nan_to_num(deviation, nan=torch.inf, posinf=torch.inf)
-        return _linear(deviation[..., None], k)[:, : steps + 1, 0]
+        return _linear(self.loop.xhat[:, :, : -(-steps // k) + 1], k)[:, :, : steps + 1]
 
     @property
     def nbytes(self) -> int:
@@ -260,8 +236,8 @@ class RecurrenceSpan(Span):
         self._runs.take(steps)
 
     @override
-    def spread(self, steps: int) -> Tensor | None:
-        return self._runs.spread(self.at_sample, steps)
+    def members(self, steps: int) -> Tensor | None:
+        return self._runs.members(steps)
 
     @property
     @override

@@ -353,7 +353,8 @@ def spoiled_hdf5(path: Path, draw: random.Random) -> str:
         name, kind = draw.choice(names), draw.randrange(12)
         values = file[name][()]
         is_number = isinstance(values, np.ndarray | np.generic) and values.dtype.kind in "fiu"
-        kind = 0 if name == "trust" and kind == 1 else kind  # ∞ where a run diverged
+        if kind < 3:  # ∞ where a run diverged, and NaN where no bound is known
+            kind = {"signal": 0, "bound": 2, "error": 2}.get(name, kind)
         if kind in (0, 1, 2) and is_number:
             values = np.array(values, dtype=float if values.dtype.kind != "f" else values.dtype)
             flat = values.reshape(-1)

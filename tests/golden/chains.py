@@ -47,7 +47,6 @@ COLUMNS = {
     "sample": "sample",
     "gamma": "gamma",
     "handed over": "fallback_share",
-    "estimated error": "estimated_error",
     "true error": "distance_max",
 }
 

@@ -151,10 +151,6 @@ def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
     steep = pipeline_at(tmp_path, *FORCED, "deploy.changes={scene.forcing.gravity.tilt.angle:60}")
     for stage in ("simulate", "deploy"):
         steep.run(stage)
-    beyond = steep.scene.forcing.reach(steep.scene.gravity)
-    for index, held_out in enumerate(steep.held_out):
+    for index in range(len(steep.held_out)):
         rollout = Rollout.open(steep.deployment.file(rollout_file(index)))
-        gravity = steep.deployed.at(held_out).acting_gravity.at(rollout.t[:-1])
-        outside = np.linalg.norm(gravity - steep.scene.gravity, axis=1) > beyond
-        assert outside.any()
-        assert (rollout.trust[1:][outside] > 1.0).all()
+        assert (rollout.verdict.flag, rollout.verdict.beyond) == ("red", True)

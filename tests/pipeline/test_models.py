@@ -38,7 +38,6 @@ def test_interpolated_latents_are_a_model(copied, pipeline_at):
     assert row["displacement_error"] == pytest.approx(row["displacement_interpolated"], rel=1e-9)
     kept = Rollout.open(pipeline.deployment.file("rollout_0.h5"))
     assert set(kept.stops) == {"latent"}
-    assert kept.estimate is None
     again = Pipeline.of_run(pipeline.deployment, say=lambda line: None)
     solver = again.solver_at(again.manifold(), angle(26.0))
     solver.step(solver.total_steps)
@@ -49,8 +48,8 @@ def test_beyond_its_training_an_interpolated_run_may_be_projected(copied, pipeli
     root, keys = copied("simulate", "train"), ("model=interpolate", "scene.design.test=[60]")
     pipeline, _, said = run_of(pipeline_at, root, *keys, "fallback=projected")
     kept = Rollout.open(pipeline.deployment.file("rollout_0.h5"))
-    assert kept.by_latent_model == 0 or kept.trust[: kept.by_latent_model].max() <= 1.0
-    assert any("is none of the cases that the model was trained for" in line for line in said)
+    assert (kept.by, kept.verdict.flag, "latent" in kept.stops) == ("projected", "red", False)
+    assert any("goes to projected, since interpolate is red: friction_angle=60 is outside" in s for s in said)
     handed, rows, _ = run_of(pipeline_at, root, *keys, "fallback=full")
     assert Rollout.open(handed.deployment.file("rollout_0.h5")).handed_over == 0
     assert rows["delta"][0] < 1e-6

@@ -8,6 +8,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
+from nsf.deployment.trust import bound_text, percent
 from nsf.inverse.fit import CONFIDENCE, Fit, fit
 from nsf.inverse.model import Model
 from nsf.inverse.observations import AXES, Observations, View
@@ -31,7 +32,10 @@ _TERMS = (
         "residual",
         "observed less seen in a run, over s, where s² is the square of the deviation and the model's.",
     ),
-    ("distrust", "how far the fitted run is from what was taught; above 1 it is not to be believed."),
+    (
+        "error bound",
+        "of the displacement error of the run, as validation runs show it (docs/method.md, Trust).",
+    ),
 )
 _POINTS = "Observed and fitted points at the last time that was observed."
 _RESIDUALS = "Observations less runs over time; the full-order run is at the estimate."
@@ -84,7 +88,10 @@ def calibration(
             *([_points(model, best, rows)] if rows["what"].isin(AXES).any() else []),
             Chart("Observed and fitted", "residuals", _RESIDUALS, residuals_chart(rows)),
         ],
-        facts=[("Distrust of the fitted run", number(best.distrust)), ("Seconds", number(best.seconds))],
+        facts=[
+            ("Error bound of the fitted run", percent(best.error_bound)),
+            ("Seconds", number(best.seconds)),
+        ],
         definitions=_TERMS,
         warnings=warnings_of(best, view.observations),
         settings={
@@ -107,10 +114,8 @@ def warnings_of(best: Fit, observations: Observations) -> list[str]:
             f"the model's own error among these, {observations.place(k)} by {abs(best.residuals[k]):.3g}; "
             "look for a wrong unit, point or time"
         )
-    if best.distrust > 1.0:
-        warnings.append(
-            f"the fitted run is {best.distrust:.3g} times as far from what was taught as may be believed"
-        )
+    if best.error_bound > best.limit:
+        warnings.append(f"the fitted run is not to be believed: {bound_text(best.error_bound, best.limit)}")
     return warnings
 
 
@@ -128,7 +133,7 @@ def _estimate(best: Fit, model: Model) -> pd.DataFrame:
             "fitted": best.fitted,
             "share_of_model": best.share,
             "degrees_of_freedom": best.freedom,
-            "distrust": best.distrust,
+            "error_bound": best.error_bound,
         }
     )
 

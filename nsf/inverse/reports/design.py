@@ -5,6 +5,7 @@ from contextlib import suppress
 
 import pandas as pd
 
+from nsf.deployment.trust import bound_text, percent
 from nsf.errors import ConfigError
 from nsf.inverse.design import Designed, Program, Tilt, design, full_order
 from nsf.inverse.error import ModelError
@@ -19,7 +20,10 @@ _LEAD = "A program of forcing that is to bring a target about, from gradients th
 _TERMS = (
     ("off", "root mean square, over the targets, of the target less what a run has."),
     ("the model's own error", "the same of runs by recurrence less full-order runs, in validation cases."),
-    ("distrust", "how far the run is from what was taught; above 1 it is not to be believed."),
+    (
+        "error bound",
+        "of the displacement error of the run, as validation runs show it (docs/method.md, Trust).",
+    ),
 )
 
 
@@ -63,7 +67,7 @@ def designing(
         tables=[frame_table("How far off", table, f"{len(rows)} target{'s' * (len(rows) != 1)}.")],
         files={"program.csv": pd.DataFrame({"t": model.t} | ways), "targets.csv": rows},
         charts=[Chart("Program", "program", over, drawn), Chart("Program", "targets", less, left)],
-        facts=[("Search", designed.stopped), ("Distrust", number(designed.distrust))],
+        facts=[("Search", designed.stopped), ("Error bound", percent(designed.error_bound))],
         definitions=_TERMS,
         warnings=_warnings(program, designed, rms((rows["value"] - rows["fitted"]) / rows["tolerance"])),
         settings={"seed": seed, "knots": program.knots, "bounds": program.coordinates.bounds.tolist()},
@@ -78,10 +82,8 @@ def _warnings(program: Program, designed: Designed, missed: float) -> list[str]:
             f"no program was found that reaches the targets; the best misses them by {missed:.3g} "
             "tolerances; allow wider bounds or more knots, or choose targets nearer by"
         )
-    if designed.distrust > 1.0:
-        warnings.append(
-            f"the run is {designed.distrust:.3g} times as far from what was taught as may be believed"
-        )
+    if designed.error_bound > (limit := program.model.trust.limit):
+        warnings.append(f"the run is not to be believed: {bound_text(designed.error_bound, limit)}")
     if isinstance(program, Tilt) and not program.model.scene.forcing.gravity:
         warnings.append(
             "gravity was the same in all training runs, so the fields know no shape that a tilt makes; train "

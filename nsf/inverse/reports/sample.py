@@ -19,7 +19,10 @@ from nsf.runs import Run
 
 _LEAD = "Runs by recurrence at parameters that are drawn from stated distributions."
 _TERMS = (
-    ("distrusted", "runs that are not to be believed; no quantile counts them (docs/method.md, Trust)."),
+    (
+        "distrusted",
+        "runs whose error bound passes trust.limit; no quantile counts them (docs/method.md, Trust).",
+    ),
     ("first order, total", "share of the variance that a parameter makes alone, and with all others."),
     ("posterior", "the parameters given the observations, the reduced model's own error included."),
 )
@@ -140,11 +143,11 @@ def _designs(count: int, full_order: int, prior: Prior) -> str:
 
 
 def _each(problem: Problem, made: Runs) -> pd.DataFrame:
-    """A row a run: its parameters, values at the end and distrust, with six digits."""
+    """A row a run: its parameters, values at the end and error bound, with six digits."""
     rows = pd.DataFrame(made.parameters, columns=list(problem.model.names))
     for k, name in enumerate(made.names):
         rows[name] = made.values[:, k, -1]
-    return rows.assign(distrust=made.distrust).map(lambda value: float(f"{value:.6g}"))
+    return rows.assign(error_bound=made.error_bound).map(lambda value: float(f"{value:.6g}"))
 
 
 def _quantiles(scalars: Scalars, bands: dict[str, np.ndarray]) -> pd.DataFrame:

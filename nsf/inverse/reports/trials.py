@@ -17,7 +17,7 @@ _TERMS = (
     ("intervals that hold", "share of the 90 % intervals that have the truth inside."),
     ("the model's own", "share of the standard error's square that is the reduced model's own error."),
     ("calibration", "median wall time of one, the model's own error included; the model is loaded."),
-    ("distrusted", "trials whose fitted run is not to be believed (distrust ratio above 1)."),
+    ("distrusted", "trials whose fitted run is not to be believed: its error bound passes trust.limit."),
 )
 _LEAD = (
     "How near do parameters come that are estimated from a few noisy points of a full-order run at "
@@ -79,6 +79,6 @@ def _rows(model: Model, table: pd.DataFrame, fits: Sequence[Fit]) -> list[dict]:
             "median standard error": part["standard_error"].median(),
             "of it the model's own [%]": 100 * float(np.median([fit.share[k] for fit in fits])),
             "calibration [s]": part["seconds"].median(),
-            "distrusted": int((part["distrust"] > 1.0).sum()),
+            "distrusted": sum(fit.error_bound > fit.limit for fit in fits),
         })  # fmt: skip
     return rows

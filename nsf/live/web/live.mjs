@@ -9,7 +9,6 @@ import { Tilt } from "./tilt.mjs";
 import { Trust } from "./trust.mjs";
 
 const MOST = 50000; // steps that a run of a hand may take
-const LOOKS = 24; // moments of a run made anew at which it is looked at
 const SPEEDS = [0.0625, 0.125, 0.25, 0.5, 1, 2, 4];
 const SHOWN_IN = 4; // [s] about, in which a run is shown at first
 
@@ -22,13 +21,11 @@ export class Live {
     this.rest = arrays.rest;
     this.deformation = new Field(packed, "deformation");
     this.stress = told.fields.stress ? new Field(packed, "stress") : null;
-    this.trust = new Trust(packed, this.deformation);
+    this.trust = new Trust(packed);
     /** @type {Map<string, Recording>} */
     this.recordings = new Map(Object.keys(told.recordings).map((name) => [name, new Recording(packed, name)]));
     this.run = new Run(new Recurrence(packed), told.start, told.dt, MOST);
     this.cursor = 0; // of steps, with its fraction
-    /** @type {number[]} distance from the training runs in the steps that were looked at */ this.tube = [];
-    /** @type {number[]} largest distance of gravity up to each step */ this.gravity = [];
     this.case = told.cases[0];
     this.take(0);
   }
@@ -65,12 +62,9 @@ export class Live {
 
   /** Make the run anew up to the moment that is shown. */
   anew() {
-    const step = this.step;
     this.run.again(Math.ceil(this.cursor - 1e-9));
-    this.tube = [];
-    this.gravity = [];
+    this.trust.forget();
     this.cursor = Math.min(this.cursor, this.run.steps);
-    for (let k = 1; k < LOOKS; k++) this._look(Math.floor((k * step) / LOOKS));
   }
 
   /**
@@ -157,15 +151,7 @@ export class Live {
 
   /** The light, for all steps up to the one that is shown. */
   light() {
-    const n = this.step, { run } = this;
-    this._look(n);
-    for (let k = this.gravity.length; k < n; k++)
-      this.gravity.push(Math.max(this.gravity[k - 1] ?? 0, this.trust.ofGravity(run.gravities[k])));
-    let tube = 0;
-    for (let k = 0; k <= n; k++) tube = Math.max(tube, this.tube[k] ?? 0);
-    const diverged = run.diverged && n === run.steps ? n * run.dt : null;
-    const estimate = this.held ? this.case.estimate : null;
-    return this.trust.light(this.parameters, tube, n ? this.gravity[n - 1] : 0, diverged, estimate);
+    return this.trust.light(this.run, this.parameters, this.step, this.step === this.told.steps);
   }
 
   /** The latent trajectory, as a table. */
@@ -183,13 +169,7 @@ export class Live {
   _forget() {
     this.cursor = this.step;
     this.run.rewind(this.step);
-    this.tube.length = Math.min(this.tube.length, this.step + 1);
-    this.gravity.length = Math.min(this.gravity.length, this.step);
-  }
-
-  /** @param {number} n */
-  _look(n) {
-    if (n > 0) this.tube[n] ??= this.trust.ofLatent(this.run.latents[n]);
+    this.trust.forget(Math.floor(this.run.steps / this.run.recurrence.stride) + 1);
   }
 }
 
@@ -305,9 +285,7 @@ export class LivePlayer extends Live {
       const stored = this.held && this.case.recording ? "Left: the reduced run; right: the full-order one." : "No full-order run of this was stored.";
       find("sides").textContent = find("truth").checked ? stored : "";
     }
-    const estimate = this.held && this.case.estimate !== null
-      ? ` Estimated error, at most ${(1000 * this.case.estimate).toPrecision(2)} mm.` : "";
-    return { light: this.light(), note: `Strides of ${Number((this.told.dt * this.run.recurrence.stride).toPrecision(3))} s by a recurrence.${estimate}` };
+    return { light: this.light(), note: `Strides of ${Number((this.told.dt * this.run.recurrence.stride).toPrecision(3))} s by a recurrence.` };
   }
 
   /** @param {import("./page.mjs").Page} page */

@@ -34,11 +34,11 @@ export class StreamPlayer {
     this.received = { frames: 0, bytes: 0 };
     this.rate = { frames: 0, bytes: 0 }; // in the last second
     this.made = 0; // latent steps a second, by the server
-    this.trust = 0;
+    this.error = this.bound = NaN; // shares of the displacement
     this.beside = [0, 0, 0];
     this.x = this.rest;
     /** @type {ArrayBuffer | null} */ this.newest = null;
-    this.state = { values: /** @type {number[]} */ ([]), away: 0, diverged: false, playing: true, color: this.color, tilted: false, known: /** @type {number | null} */ (null) };
+    this.state = { values: /** @type {number[]} */ ([]), light: { flag: /** @type {import("./trust.mjs").Flag} */ ("unknown"), reason: "" }, playing: true, color: this.color, tilted: false, known: /** @type {number | null} */ (null) };
     this.socket = new WebSocket(location.href.replace(/#.*/, "").replace(/^http/, "ws").replace(/\/(\?|$)/, "/stream$1"));
     this.socket.binaryType = "arraybuffer";
     /** @type {any[]} */ this.sliders = [];
@@ -116,13 +116,13 @@ export class StreamPlayer {
     const buffer = this.newest;
     this.newest = null;
     if (this.field) {
-      const [t, trust, ...xhat] = new Float32Array(buffer), x = this.field.at(xhat, []);
-      Object.assign(this, { t, trust, x });
+      const [t, error, bound, ...xhat] = new Float32Array(buffer), x = this.field.at(xhat, []);
+      Object.assign(this, { t, error, bound, x });
       this.body?.show(x, (rows) => displacement(x, this.rest, this.told.quantities.displacement.top, rows));
       return;
     }
     const { moment, x, shade, roles, "full.x": fullX, "full.shade": fullShade } = unpacked(buffer).arrays;
-    [this.t, this.trust, this.cursor, this.made] = moment;
+    [this.t, this.error, this.bound, this.cursor, this.made] = moment;
     this.x = x;
     const picked = (/** @type {import("./data.mjs").Numbers} */ values) => (/** @type {Uint32Array} */ rows) => Float32Array.from(rows, (p) => values[p]);
     this.body?.show(x, picked(shade));
@@ -132,9 +132,9 @@ export class StreamPlayer {
   }
 
   tell() {
-    const { told, state, rate, t } = this;
+    const { told, state, rate } = this;
     const named = told.parameters.map((/** @type {any} */ p, /** @type {number} */ i) => `${p.name} = ${valued(state.values[i] ?? NaN, p.unit, p.step)}`);
-    const light = lightOf(this.trust, state.away, state.diverged && !Number.isFinite(this.trust), t);
+    const light = lightOf(this.error, this.bound, 1, state.light.reason, state.light.flag);
     if (!this.field) {
       const what = `${named.join(", ")}${state.tilted ? ", gravity tilted by hand" : ""}`, made = this.made ? `; ${Math.round(this.made)} latent steps a second` : "";
       const beside = state.known === null ? `no full-order run of this ${state.tilted ? "program" : "case"}` : "left: reduced, right: full-order";

@@ -1,9 +1,14 @@
-// Whether a run by a recurrence is to be believed, and why not, as far as a page can tell without a projected step.
+// The bound of a run's error, and whether to believe the run, as `nsf.deployment.trust` has it.
 
 /** @typedef {import("./data.mjs").Packed} Packed */
-/** @typedef {import("./field.mjs").Field} Field */
 /** @typedef {import("./field.mjs").Vector} Vector */
-/** @typedef {{ level: "good" | "away" | "bad", text: string, ratio: number }} Light */
+/** @typedef {import("./recurrence.mjs").Run} Run */
+/** @typedef {"green" | "amber" | "red" | "unknown"} Flag */
+/** @typedef {{ level: Flag, text: string }} Light */
+/** @typedef {{ signal: number, moved: number, left: boolean, gravity: number }} Look at one stride */
+
+const ROUND_OFF = 1e-6; // of a value: what float32 may have moved it by
+const AWAY = 0.5; // growth of a bound a side of the box of parameters away from the nearest validation case
 
 /**
  * A number and its unit, as text.
@@ -17,123 +22,133 @@ export function quantity(value, unit, digits = 3) {
   return ["", "-", "1"].includes(unit) ? `${shown}` : `${shown} ${unit}`;
 }
 
-/** How far a moment is from what the model was trained and taught on. */
-export class Trust {
-  /**
-   * @param {Packed} packed
-   * @param {Field} deformation
-   */
-  constructor({ header, arrays }, deformation) {
-    this.told = header.trust;
-    /** @type {{ name: string, unit: string, trained: number[] }[]} */ this.parameters = header.parameters;
-    this.deformation = deformation;
-    this.matrix = arrays["tube.matrix"]; // [q, K]: distances of its products are those of S [m]
-    const scale = arrays["tube.scale"], known = arrays["tube.known"];
-    this.known = Float32Array.from(known, (value, i) => value * scale[i % scale.length]);
-    this.width = scale.length;
-  }
+/**
+ * The light of an error and its bound, shares of the displacement; NaN where nothing tells.
+ * @param {number} error
+ * @param {number} bound
+ * @param {number} limit
+ * @param {string} reason
+ * @param {Flag | null} flag where it is known already
+ * @returns {Light}
+ */
+export function lightOf(error, bound, limit, reason, flag = null) {
+  const level = flag ?? (Number.isNaN(bound) ? "unknown" : bound <= 0.5 * limit ? "green" : bound <= limit ? "amber" : "red");
+  const percent = (/** @type {number} */ share) => (Number.isFinite(share) ? quantity(100 * share, "%") : "∞");
+  const errors = Number.isNaN(bound) ? "" : `error ${percent(error)}, at most ${percent(bound)} of the displacement`;
+  return { level, text: `${level}: ${[errors, reason].filter(Boolean).join("; ")}` };
+}
 
-  /**
-   * How far the parameters are from the training cases, in units of their spacing; above 1 outside their box.
-   * @param {Vector} parameters
-   */
-  ofCase(parameters) {
-    const { cases, deviation, spacing } = this.told.cases;
-    if (!cases.length) return 0;
-    const size = (/** @type {number[]} */ values) => Math.hypot(...values) / spacing;
-    const off = this.parameters.map(({ trained: [low, high] }, i) => {
-      const beyond = Math.max(low - parameters[i], parameters[i] - high, 0);
-      return beyond > 1e-6 * Math.max(Math.abs(low), Math.abs(high)) ? beyond / deviation[i] : 0;
-    });
-    const nearest = Math.min(
-      ...cases.map((/** @type {number[]} */ own) => size(own.map((v, i) => (v - parameters[i]) / deviation[i]))),
-    );
-    return Math.max(nearest, size(off) > 0 ? 1 + size(off) : 0);
-  }
-
-  /**
-   * How far x̂ is from the nearest training snapshot at the sample particles, over the scale of such distances.
-   * @param {Vector} xhat
-   */
-  ofLatent(xhat) {
-    const { matrix, known, width } = this, a = this.deformation.coefficientsAt(xhat, []), K = a.length;
-    const y = Float64Array.from({ length: width }, (_, q) => {
-      let sum = 0;
-      for (let k = 0; k < K; k++) sum += matrix[q * K + k] * a[k];
-      return sum;
-    });
-    let nearest = Infinity;
-    for (let row = 0; row < known.length; row += width) {
-      let sum = 0;
-      for (let q = 0; q < width; q++) sum += (y[q] - known[row + q]) ** 2;
-      if (sum < nearest) nearest = sum;
-    }
-    return Math.sqrt(nearest) / this.told.distance;
-  }
-
-  /**
-   * How far gravity is from the middle of what was taught, over its reach.
-   * @param {Vector} gravity
-   */
-  ofGravity(gravity) {
-    const range = this.told.gravity;
-    if (!range) return 0;
-    const away = Math.hypot(...range.middle.map((/** @type {number} */ v, /** @type {number} */ i) => gravity[i] - v));
-    return away / Math.max(range.reach, 1e-12);
-  }
-
-  /**
-   * The light.
-   * @param {Vector} parameters of the run
-   * @param {number} tube largest `ofLatent` so far
-   * @param {number} gravity largest `ofGravity` so far
-   * @param {number | null} diverged time at which the run ceased to be finite [s]
-   * @param {number | null} estimate estimated error of the run, as its deployment had it [m]
-   * @returns {Light}
-   */
-  light(parameters, tube, gravity, diverged = null, estimate = null) {
-    const away = this.ofCase(parameters), ratio = Math.max(tube, away > 1 ? away : 0, gravity > 1 ? gravity : 0);
-    if (diverged !== null) return { level: "bad", text: `diverged at t = ${quantity(diverged, "s")}`, ratio: Infinity };
-    const outside = this.parameters.findIndex(({ trained: [low, high] }, i) => {
-      const slack = 1e-6 * Math.max(Math.abs(low), Math.abs(high));
-      return parameters[i] < low - slack || parameters[i] > high + slack;
-    });
-    if (outside >= 0) {
-      const { name, unit, trained } = this.parameters[outside];
-      const [low, high] = trained.map((value) => quantity(value, unit));
-      return { level: "bad", text: `distrusted: ${name} is outside of the training values, ${low} to ${high}`, ratio };
-    }
-    if (gravity > 1 + 1e-6) {
-      const { reach } = this.told.gravity;
-      const [was, most] = [gravity * reach, reach].map((value) => quantity(value, "m/s²"));
-      const text = `distrusted: gravity was ${was} from that which was taught, ${most} at most`;
-      return { level: "bad", text, ratio };
-    }
-    if (tube > 1)
-      return { level: "bad", text: `distrusted: the shape left the training runs, ratio ${tube.toFixed(2)}, above 1`, ratio };
-    if (away > 1)
-      return { level: "away", text: `away from the training cases, ratio ${away.toPrecision(3)}, above 1`, ratio };
-    if (estimate !== null && estimate > this.told.distance) {
-      const [most, scale] = [estimate, this.told.distance].map((value) => quantity(1000 * value, "mm", 2));
-      const text = `the run may be ${most} off; training runs are ${scale} from each other`;
-      return { level: "away", text, ratio };
-    }
-    return { level: "good", text: `distrust ratio ${ratio.toFixed(2)}, below 1`, ratio };
-  }
+/** Root mean square over time, by the trapezoidal rule. @param {number[]} values at even steps */
+function rms(values) {
+  const last = values.length - 1, square = (/** @type {number} */ k) => values[k] * values[k];
+  if (!last) return Math.abs(values[0]);
+  return Math.sqrt((values.reduce((sum, _, k) => sum + square(k), 0) - 0.5 * (square(0) + square(last))) / last);
 }
 
 /**
- * The light of a run that a server takes, as `nsf view` has it.
- * @param {number} trust largest distrust ratio so far
- * @param {number} away how far the case is from the training cases
- * @param {boolean} diverged
- * @param {number} t [s]
- * @returns {Light}
+ * Values at times, linear between them and constant beyond.
+ * @param {number[]} times
+ * @param {number[]} values
+ * @param {number} t
  */
-export function lightOf(trust, away, diverged, t) {
-  if (diverged) return { level: "bad", text: `diverged at t = ${quantity(t, "s")}`, ratio: Infinity };
-  if (trust > 1) return { level: "bad", text: `distrusted: ratio ${trust.toFixed(2)}, above 1`, ratio: trust };
-  if (away > 1)
-    return { level: "away", text: `away from the training cases: ratio ${away.toPrecision(3)}, above 1`, ratio: away };
-  return { level: "good", text: `distrust ratio ${trust.toFixed(2)}, below 1`, ratio: trust };
+function between(times, values, t) {
+  const k = times.findIndex((time) => time > t);
+  if (k <= 0) return k === 0 ? values[0] : values[values.length - 1];
+  const part = (t - times[k - 1]) / (times[k] - times[k - 1]);
+  return values[k - 1] + part * (values[k] - values[k - 1]);
+}
+
+/** Judges runs by a recurrence of several members, from what their strides say. */
+export class Trust {
+  /** @param {Packed} packed */
+  constructor({ header }) {
+    /** @type {any} */ this.told = header.trust ?? {};
+    /** @type {{ name: string, unit: string }[]} */ this.parameters = header.parameters;
+    /** @type {Look[]} */ this.looks = [];
+  }
+
+  /** Forget what came after a number of strides. @param {number} strides */
+  forget(strides = 0) {
+    this.looks.length = Math.min(this.looks.length, strides);
+  }
+
+  /**
+   * The light of a run up to a step.
+   * @param {Run} run
+   * @param {Vector} parameters
+   * @param {number} step
+   * @param {boolean} whole whether it is at the end of the scene
+   * @returns {Light}
+   */
+  light(run, parameters, step, whole) {
+    const { told, looks } = this, { stride } = run.recurrence, last = Math.min(Math.floor(step / stride), run.states.length - 1);
+    if (!told.metric || run.recurrence.motions.length < 2) return lightOf(NaN, NaN, 1, "this page has no bound of the error");
+    while (looks.length <= last) looks.push(this._look(run, looks.length));
+    const seen = looks.slice(0, last + 1), diverged = run.diverged && step >= run.steps;
+    const reason = this._outside(parameters, Math.max(...seen.map(({ gravity }) => gravity)), seen.findIndex(({ left }) => left) * stride * run.dt);
+    const { calibration, limit } = told, more = reason || (diverged ? `it diverged at t = ${quantity(step * run.dt, "s")}` : "");
+    if (!calibration) return lightOf(NaN, NaN, limit, more || "no validation run tells", reason || diverged ? "red" : null);
+    const own = rms(seen.map(({ moved }) => moved)), D = whole ? own : Math.max(own, calibration.displacement);
+    const base = seen.map(({ signal }, k) => Math.max(D * between(calibration.t, calibration.curve, k * stride * run.dt), calibration.slope * signal));
+    const expected = D > 0 ? (this._away(parameters) * rms(base)) / D : 0, of = (/** @type {number | null} */ factor) => (diverged ? Infinity : expected * (factor ?? Infinity));
+    const few = calibration.errors.length === 1 ? "the bound is coarse, of one validation run" : calibration.errors.length ? "" : "every validation run was lost";
+    return lightOf(of(calibration.typical), of(calibration.factor), limit, more || few, reason ? "red" : null);
+  }
+
+  /**
+   * What the members say at a stride.
+   * @param {Run} run
+   * @param {number} stride
+   * @returns {Look}
+   */
+  _look(run, stride) {
+    const members = run.states[stride].map(({ xhat }) => this._metres(xhat)), M = members.length;
+    const mean = members[0].map((_, j) => members.reduce((sum, own) => sum + own[j], 0) / M), start = this._metres(run.start.xhat);
+    const squares = members.reduce((sum, own) => sum + own.reduce((part, value, j) => part + (value - mean[j]) ** 2, 0), 0);
+    const { low, high, leeway } = this.told.reach.states;
+    const slack = low.map((/** @type {number} */ value, /** @type {number} */ j) => ROUND_OFF * Math.max(Math.abs(value), Math.abs(high[j])));
+    const beyond = mean.map((value, j) => Math.max(low[j] - slack[j] - value, value - high[j] - slack[j], 0));
+    const size = 0.5 * Math.hypot(...high.map((/** @type {number} */ value, /** @type {number} */ j) => value - low[j])) || 1;
+    const { gravity } = this.told.reach, steps = run.gravities.slice(Math.max(0, stride - 1) * run.recurrence.stride, stride * run.recurrence.stride);
+    return {
+      signal: Math.sqrt(squares / (M - 1)),
+      moved: Math.hypot(...mean.map((value, j) => value - start[j])),
+      left: Math.hypot(...beyond) / size > leeway,
+      gravity: Math.max(0, ...steps.map((acting) => Math.hypot(...acting.map((value, i) => value - gravity[i])))),
+    };
+  }
+
+  /**
+   * Why a run is outside of what was taught; empty where it is not.
+   * @param {Vector} parameters
+   * @param {number} gravity largest distance from the middle of what was taught [m/s²]
+   * @param {number} left time at which the shape left those of training [s]; negative: at none
+   */
+  _outside(parameters, gravity, left) {
+    const { box, radius, gravity: middle, changed } = this.told.reach;
+    if (changed) return `deploy.changes has ${changed}, which no training run had`;
+    for (const [i, [low, high]] of box.entries()) {
+      const slack = ROUND_OFF * Math.max(Math.abs(low), Math.abs(high)), { name, unit } = this.parameters[i];
+      if (parameters[i] >= low - slack && parameters[i] <= high + slack) continue;
+      return `${name}=${quantity(parameters[i], unit)} is outside of ${quantity(low, "")} … ${quantity(high, "")}`;
+    }
+    if (gravity > radius + ROUND_OFF * (radius + Math.hypot(...middle)))
+      return `gravity is ${quantity(gravity, "m/s²")} from that which was taught, ${quantity(radius, "m/s²")} at most`;
+    return left >= 0 ? `its shape left those of the training runs at t = ${quantity(left, "s")}` : "";
+  }
+
+  /** Factor on a bound, the further away from validation cases. @param {Vector} parameters */
+  _away(parameters) {
+    const { validated, reach } = this.told;
+    if (!validated.length || !reach.box.length) return 1;
+    const sides = validated.map((/** @type {number[]} */ own) =>
+      Math.max(0, ...reach.box.map(([low, high], /** @type {number} */ i) => (high > low ? Math.abs(own[i] - parameters[i]) / (high - low) : 0))));
+    return 1 + AWAY * Math.min(...sides);
+  }
+
+  /** Latent vector in metres. @param {Vector} xhat @returns {number[]} */
+  _metres(xhat) {
+    const { metric } = this.told;
+    return metric.map((_, /** @type {number} */ j) => metric.reduce((/** @type {number} */ sum, /** @type {number[]} */ row, /** @type {number} */ i) => sum + xhat[i] * row[j], 0));
+  }
 }

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Rollout, continuation_file, rollout_file
+from nsf.deployment import PROJECTED, TRUST, Rollout, Trust, continuation_file, rollout_file
 from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import (
     Comparison,
@@ -21,6 +21,7 @@ from nsf.evaluation import (
 )
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
+from nsf.pipeline.stages.calibration import beyond
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.vectors import spaced
@@ -59,6 +60,7 @@ def evaluate(pipeline, run: Run) -> None:
         offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
         origin = cost, pipeline.device, run.manifest, pipeline.model.name, offline
         table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *origin)
+        table["beyond"] = _beyond(pipeline, manifold, rollouts, comparisons)
         summary = results.summarise(pipeline.config, comparisons, beside, rollouts, seconds)
         results.write(record, table, comparisons, cost, summary)
     pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} cases → {run.id}")
@@ -113,9 +115,19 @@ def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
     return [Rollout.open(file, manifold.latent_dim) for file in files]
 
 
+def _beyond(pipeline, manifold: Manifold, rollouts, comparisons: Sequence[Comparison]) -> list[int]:
+    """Of each held-out case, 1 where it leads beyond what was taught, else 0."""
+    trust = Trust.open(pipeline.deployment.file(TRUST), manifold)
+    names = [f"encoded_{k + 1}" for k in range(manifold.latent_dim)]
+    return [
+        int(beyond(pipeline, trust, rollout.case, comparison.series[names].to_numpy()))
+        for rollout, comparison in zip(rollouts, comparisons, strict=True)
+    ]
+
+
 def _took(pipeline, rollout: Rollout) -> str | None:
-    """The engine of a run that another model began and took no step of; None: as configured."""
-    return None if rollout.by is None or rollout.by_latent_model else pipeline.projecting
+    """The engine of a run that the projected model took in place of another; None: as configured."""
+    return pipeline.projecting if rollout.by == PROJECTED else None
 
 
 def _compare(
@@ -142,8 +154,8 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
 
     Args:
         pipeline, manifold: that are timed.
-        rollouts: the reduced runs; that of the first case is decoded. Where projected steps took
-            some of a run by a recurrence, they are timed as well.
+        rollouts: the reduced runs; that of the first case is decoded. Where the projected model took
+            runs of another, its steps are timed as well.
         factors: of Δx of the coarse full-order runs that there are.
     """
     c, scene, case = pipeline.config, pipeline.deployed, pipeline.held_out[0]
@@ -153,9 +165,9 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
     reduced = Subject(lambda: pipeline.solver_at(manifold, case), steps)
     beside = {}
-    if any(rollout.projected_share for rollout in rollouts):
+    if any(rollout.by == PROJECTED for rollout in rollouts):
         engine = pipeline.projecting
-        beside["projected"] = Subject(lambda: pipeline.solver_at(manifold, case, engine=engine), steps)
+        beside[PROJECTED] = Subject(lambda: pipeline.solver_at(manifold, case, engine=engine), steps)
     coarse = coarse_subjects(scene, case, factors, c.precision, pipeline.device)
     subjects = {"full_order": full, "reduced": reduced, **beside, **coarse}
     measured = measure(subjects, c.evaluation.trials, pipeline.device)

@@ -11,8 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nsf.data import Case
-from nsf.deployment import Rollout
-from nsf.dynamics.setup import reduced_steps
+from nsf.deployment import PROJECTED, Rollout, Verdict
 from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.evaluation.surroundings import surroundings
@@ -95,7 +94,7 @@ def rows(
     }
     content = []
     for rollout, comparison, rival in zip(rollouts, comparisons, rivals, strict=True):
-        as_run = _cost_of_share(cost, rollout.projected_share)
+        as_run = _cost_by(cost, rollout.by)
         times = _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None))
         times |= {"break_even_runs": _break_even(as_run, sum(offline))}
         if rollout.diverged >= 0 or rollout.handed_over >= 0:
@@ -112,11 +111,10 @@ def rows(
             "stress_error": comparison.stress_error,
             "distance": comparison.distance,
             "distance_max": comparison.distance_max,
-            "fallback_share": _handed_over(rollout, config),
-            "estimated_error": rollout.estimated_error,
-            "distrust": float(rollout.trust.max()),
-            "distrusted_at": _time(rollout, rollout.distrusted),
-            "fallback_at": _time(rollout, rollout.handed_over),
+            "fallback_share": float(bool(rollout.by)),
+            "error_bound": rollout.verdict.bound_share,
+            "flag": rollout.verdict.flag,
+            "flag_reason": rollout.verdict.reason,
         }
         off = {f"{name}_error": comparison.quantities.get(name, math.nan) for name in QUANTITIES}
         content.append(shared | of_case | _beside(rival) | times | off)
@@ -127,11 +125,6 @@ def _material(config: DictConfig) -> str:
     """The name of the law, as `von_mises`."""
     name = str(config.material.get("_target_", "")).rpartition(".")[2]
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
-
-
-def _time(rollout: Rollout, step: int) -> float:
-    """Time [s] of a step; NaN of none."""
-    return float(rollout.t[step]) if step >= 0 else math.nan
 
 
 def _beside(rivals: Rivals) -> dict[str, float]:
@@ -145,16 +138,9 @@ def _beside(rivals: Rivals) -> dict[str, float]:
     }
 
 
-def _cost_of_share(cost: dict, share: float) -> dict:
-    """`cost.json` of a run by a recurrence, of which the projected step took a share."""
-    if not share or "projected" not in cost:
-        return cost
-    reduced, projected = cost["reduced"], cost["projected"]
-    times = {
-        name: (1.0 - share) * reduced[name] + share * projected[name] for name in ("step_ms", "total_ms")
-    }
-    memory = max(reduced["memory_mib"], projected["memory_mib"])
-    return cost | {"reduced": reduced | times | {"memory_mib": memory}}
+def _cost_by(cost: dict, by: str) -> dict:
+    """`cost.json` of a run that another model took."""
+    return cost | {"reduced": cost[PROJECTED]} if by == PROJECTED and PROJECTED in cost else cost
 
 
 def _costs_in_a_row(cost: dict, factor: int | None) -> dict[str, float]:
@@ -184,30 +170,11 @@ def _break_even(cost: dict, seconds: float) -> float:
     return math.inf if saved <= 0.0 else seconds / saved
 
 
-def _handed_over(rollout: Rollout, config: DictConfig) -> float:
-    """Share of the steps that were not taken by the first level: a recurrence, or else the projected step."""
-    steps = reduced_steps(config.scene.steps, config.deploy.dt_multiplier)
-    first = steps if rollout.handed_over < 0 else rollout.handed_over
-    if rollout.by is not None:
-        first = min(first, rollout.by_latent_model)
-    return 1.0 - first / steps
-
-
-def trust_of(rollout: Rollout) -> dict:
-    """Entry of `summary.json`: times in s, null where nothing happened; a ratio of ∞ is null too."""
-    largest = float(rollout.trust.max())
-
-    def when(step: int) -> float | None:
-        return float(rollout.t[step]) if step >= 0 else None
-
-    return {
-        "case": rollout.case.named,
-        "away": rollout.away if math.isfinite(rollout.away) else None,
-        "trust": largest if math.isfinite(largest) else None,
-        "distrusted": rollout.distrusted >= 0,
-        "distrusted_at": when(rollout.distrusted),
-        "handed_over_at": when(rollout.handed_over),
-    }
+def trust_of(case: Case, verdict: Verdict) -> dict:
+    """Entry of `summary.json`; a number that is not finite is null."""
+    numbers = {"error": verdict.error_share, "error_bound": verdict.bound_share}
+    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+    return {"case": case.named, **finite, "flag": verdict.flag, "reason": verdict.reason}
 
 
 def summarise(
@@ -231,7 +198,7 @@ def summarise(
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
         "reconstruction_delta": mean("reconstruction_delta"),
         "reconstruction_stress_error": mean("reconstruction_stress_error"),
-        "trust": [trust_of(rollout) for rollout in rollouts],
+        "trust": [trust_of(rollout.case, rollout.verdict) for rollout in rollouts],
         "rivals": [
             {"case": rollout.case.named} | asdict(beside)
             for rollout, beside in zip(rollouts, rivals, strict=True)

@@ -409,7 +409,7 @@ class Fails:
 def test_divergence_names_its_step(solver_of, tiny_trust):
     run = rollout(solver_of(projector=Fails(at=4)), angle(26.0), tiny_trust)
     assert run.diverged == 4
-    assert np.isposinf(run.trust[4:]).all()
+    assert np.isposinf(run.verdict.bound[4:]).all()
 
 
 # -- refusals -------------------------------------------------------------------------------------------

@@ -11,11 +11,11 @@ from angles import angle, rollout
 import nsf
 import nsf.scenes
 from nsf.data import Trajectory
-from nsf.deployment import FULL_ORDER, LATENT_MODEL, PROJECTED, Rollout, go_on
+from nsf.deployment import FULL_ORDER, Rollout, Verdict
 from nsf.dynamics import Sources
 from nsf.errors import InstabilityError, SchemaError
 from nsf.evaluation import at_frames, compare, metrics
-from nsf.evaluation.compare import _shown, levels_at_frames, trust_at_frames
+from nsf.evaluation.compare import _shown, bound_at_frames
 
 ERRORS = ["delta", "displacement_error", "stress_error"]
 MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
@@ -23,8 +23,9 @@ MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
 
 def rollout_of(t, xhat, diverged=-1):
     n = len(t) - 1
-    stops, trust = ["converged"] * n, np.zeros(n + 1)
-    return Rollout(angle(26.0), t, xhat, np.zeros((n, 2)), stops, trust, 0.0, 20, 50.0, 0, 1.0, diverged)
+    none = np.zeros(n + 1)
+    told = ["converged"] * n, none, Verdict(none, none, 1.0, 0.2)
+    return Rollout(angle(26.0), t, xhat, np.zeros((n, 2)), *told, 20, 50.0, 0, 1.0, diverged)
 
 
 @pytest.fixture(scope="module")
@@ -97,11 +98,10 @@ def test_series(comparison_of, made, truth):
     series = comparison_of(made).series
     latents = [f"{kind}_{k}" for kind in ("xhat", "encoded") for k in range(1, 5)]
     first = ["case", "split", "frame", "t"]
-    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", "trust", "by", *latents]
+    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", "error_bound", *latents]
     assert len(series) == truth.frames == 25
     assert set(series["split"]) == {"test"}
     np.testing.assert_array_equal(series["t"], truth.t)
-    np.testing.assert_array_equal(series["by"], [np.nan] + 24 * [PROJECTED])
     np.testing.assert_allclose(series[[f"xhat_{k}" for k in range(1, 5)]], made.xhat, rtol=1e-12)
     assert np.isnan(series["displacement_error"][0])  # nothing has moved yet
     assert np.isfinite(series[[*ERRORS, *MOMENTA]][1:]).all().all()
@@ -148,15 +148,6 @@ def test_frames_between_deployment_steps():
 
 def test_frames_at_deployment_steps_are_exact(made):
     assert np.array_equal(at_frames(made, made.t), made.xhat)
-
-
-def test_who_took_the_step_to_each_frame(made):
-    by = np.repeat(np.array([LATENT_MODEL, PROJECTED], np.int8), [10, 14])
-    run = replace(made, by=by, estimate=np.zeros(25))
-    t = np.append(0.0, made.t[1:])
-    np.testing.assert_array_equal(levels_at_frames(run, t), [np.nan, *by])
-    handed = replace(run, handed_over=12)
-    np.testing.assert_array_equal(levels_at_frames(handed, t), [np.nan, *by[:12], *[FULL_ORDER] * 12])
 
 
 def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_trust, comparison_of, made):
@@ -210,7 +201,7 @@ def test_a_run_lost_at_infinity(comparison_of, made):
     xhat[7:, 0] = np.inf
     lost = comparison_of(replace(made, xhat=xhat, diverged=7))
     assert lost.delta == np.inf
-    assert not lost.series[1:].isna().any().any()
+    assert not lost.series[1:].drop(columns="error_bound").isna().any().any()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -320,48 +311,37 @@ def test_other_particles_are_refused(chain, tiny, tiny_manifold, made, tmp_path)
 
 
 @pytest.fixture(scope="module")
-def continuation(chain, tiny_manifold, made, tmp_path_factory):
-    """A rollout that was handed over at step 10, and its full-order rest."""
-    handed = replace(made, handed_over=10, xhat=made.xhat[:13], t=made.t[:13], trust=0.1 * np.arange(13))
-    solver = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu")
-    path = tmp_path_factory.mktemp("rest") / "continuation.h5"
-    go_on(solver, handed, path)
-    with Trajectory.open(path) as rest:
-        yield handed, rest
+def taken(made):
+    """A run that the full-order solver took from its beginning."""
+    start = {name: getattr(made, name)[:1] for name in ("t", "xhat", "signal")}
+    return replace(made, **start, residuals=made.residuals[:0], stops=[], by=FULL_ORDER)
 
 
 @pytest.mark.parametrize("chunk", [None, 4])
-def test_a_continued_run_is_compared_with_its_own_frames(
-    continuation, chunk, chain, tiny_manifold, truth, comparison_of, made, monkeypatch
+def test_a_run_by_the_full_order_solver_has_its_frames(
+    taken, chunk, chain, tiny_manifold, truth, monkeypatch
 ):
     if chunk:
         monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "frames_at_once", lambda *of: chunk)
-    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu"), continuation
-    found = compare(solver, truth, handed, "test", (500, 25), rest)
-    reduced = comparison_of(made).series
-    np.testing.assert_allclose(found.series["delta"][:11], reduced["delta"][:11], rtol=1e-9)
-    x, x_rom = (source.read("x").astype(float) for source in (truth, rest))
-    expected = np.linalg.norm(x_rom - x[10:], axis=(1, 2)) / np.linalg.norm(x[10:], axis=(1, 2))
-    np.testing.assert_allclose(found.series["delta"][11:], expected[1:], rtol=1e-6)
-    np.testing.assert_allclose(found.pictures["x_reduced"][11:], x_rom[1:], rtol=1e-6)
-    stress = metrics.von_mises(torch.as_tensor(np.asarray(rest.read("tau"))[1:]).double())
-    np.testing.assert_allclose(found.pictures["stress_reduced"][11:], stress, rtol=1e-6)
-    assert np.isfinite(found.series[MOMENTA]).all().all()
-    np.testing.assert_allclose(found.series["trust"][:11], 0.1 * np.arange(11))
-    assert found.series.loc[11:, ["trust", "xhat_1"]].isna().all().all()
+    solver = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu")
+    comparison = compare(solver, truth, taken, "test", (500, 25), truth)
+    assert comparison.series.loc[1:, ["delta", "displacement_error", "stress_error"]].max(axis=None) == 0.0
+    np.testing.assert_allclose(comparison.pictures["x_reduced"][1:], truth.read("x")[1:], rtol=1e-6)
+    assert np.isfinite(comparison.series[MOMENTA]).all().all()
+    assert comparison.series.loc[1:, ["error_bound", "xhat_1"]].isna().all().all()
 
 
-def test_a_continuation_must_reach_the_end(continuation, chain, tiny_manifold, truth):
-    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu"), continuation
-    for wrong, run in ((None, handed), (rest, replace(handed, handed_over=9))):
-        with pytest.raises(SchemaError, match=r"handed over at frame \d+ of 24"):
-            compare(solver, truth, run, "test", (10, 2), wrong)
+def test_such_frames_must_be_there(taken, chain, tiny_manifold, truth):
+    solver = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu")
+    with pytest.raises(SchemaError, match=r"handed over at frame 0 of 24"):
+        compare(solver, truth, taken, "test", (10, 2), None)
 
 
-def test_trust_at_frames_between_deployment_steps(made):
-    run = replace(made, t=np.array([0.0, 1.5, 3.0]), trust=np.array([0.0, 0.5, np.inf]), handed_over=-1)
-    found = trust_at_frames(run, np.array([0.0, 1.0, 1.5, 2.0, 3.0]))
-    np.testing.assert_array_equal(found, [0.0, 0.5, 0.5, np.inf, np.inf])
+def test_bounds_at_frames_between_deployment_steps(made):
+    bound = np.array([0.0, 0.5, np.inf])
+    run = replace(made, t=np.array([0.0, 1.5, 3.0]), verdict=replace(made.verdict, bound=bound))
+    at_frames_ = bound_at_frames(run, np.array([0.0, 1.0, 1.5, 2.0, 3.0]))
+    np.testing.assert_array_equal(at_frames_, [0.0, 0.5, 0.5, np.inf, np.inf])
 
 
 @pytest.mark.parametrize(("most", "kept"), [(30, 20), (20, 20), (8, 8)])

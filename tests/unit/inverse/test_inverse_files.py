@@ -142,7 +142,7 @@ def test_trials(tmp_path, deployed, monkeypatch):
     table = pd.read_csv(folder / "results.csv")
     assert list(table) == [
         "scene", "parameter", "trial", "truth", "estimate", "standard_error", "inside_90", "seconds",
-        "distrust",
+        "error_bound",
     ]  # fmt: skip
     assert table["trial"].tolist() == [0, 0, 1, 1]
     assert set(table["inside_90"]) <= {0, 1}

@@ -43,7 +43,7 @@ def test_the_truth_is_found(model, seen, no_error):
     np.testing.assert_allclose(found.estimate, [27.0, 0.2], rtol=1e-3)
     np.testing.assert_allclose(found.fitted, found.estimate)
     assert np.abs(found.residuals).max() < 0.1
-    assert found.distrust < 1.0
+    assert found.error_bound < np.inf
 
 
 def test_its_standard_error_is_that_of_many_noises(model, seen, no_error):

@@ -71,19 +71,15 @@ def test_positions_anywhere_in_the_body(model):
     assert np.abs(at_particles[0].numpy() - X).max() < 0.01, "a run begins at rest"
 
 
-def test_distrust(model, deployed):
-    mu = model.tensor([[27.0, 0.2], [60.0, 0.2]])
-    inside, outside = model.distrust(model(mu), mu).tolist()
-    assert inside < 1.0 < outside
-    lost = model([27.0, 0.2]).clone()
-    lost[20:] = torch.nan
-    assert float(model.distrust(lost, [27.0, 0.2])) == np.inf
+def test_a_bound_is_the_deployments(model, deployed):
+    inside, outside = model.error_bound([[27.0, 0.2], [60.0, 0.2]])
+    assert inside < np.inf
+    assert outside == np.inf
     own = model.forcing()
-    upward = Forcing(-own.gravity, own.solids)
-    assert float(model.distrust(model(ONE, upward), ONE, upward)) > 1.0
-    found, every = model(ONE), np.zeros(len(model.t) - 1)
-    slow = model.trust.ratios(found.numpy(), every).max()
-    assert float(model.distrust(found, ONE)) == pytest.approx(slow, abs=0.03)
+    assert model.error_bound(ONE, Forcing(-own.gravity, own.solids)) == np.inf
+    rollout = Rollout.open(deployed.deployment.file(rollout_file(0)))
+    bound = model.error_bound([rollout.case[name] for name in model.names])
+    assert float(bound) == pytest.approx(rollout.verdict.bound_share, rel=0.05)
 
 
 def test_bad_input(model, chain):

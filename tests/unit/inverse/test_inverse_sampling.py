@@ -143,7 +143,7 @@ def test_the_command(tmp_path, deployed):
     words = [f"run={deployed.deployment.path}", "runs=50", "of=height,run_out", "device=cpu"]
     sample([*words, "friction_angle=norm(30,2)", f"folder={tmp_path / 'a'}"])
     rows = pd.read_csv(tmp_path / "a" / "runs.csv.gz")
-    assert list(rows) == ["friction_angle", "speed", "height", "run_out", "distrust"]
+    assert list(rows) == ["friction_angle", "speed", "height", "run_out", "error_bound"]
     bands = pd.read_csv(tmp_path / "a" / "quantiles.csv")
     assert set(bands["quantity"]) == {"height", "run_out"}
     assert (bands["q5"] <= bands["q95"]).all()

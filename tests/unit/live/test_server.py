@@ -23,6 +23,7 @@ pytest.importorskip("websockets", reason="websockets is not installed")
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from nsf.deployment import Trust
 from nsf.errors import ConfigError
 from nsf.live.feeds import LatentFeed, PointFeed, obey
 from nsf.live.player import Player
@@ -62,22 +63,24 @@ async def until(true):
     raise AssertionError("nothing happened within 20 s")
 
 
-def test_a_frame_is_time_trust_and_latent(model):
+def test_a_frame_is_time_errors_and_latent(model):
     async def run():
         async with streaming(model) as (_, player, port), connected(port) as client:
             assert json.loads(await client.recv()) == {
                 "values": [26.0],
-                "away": 0.5,
-                "diverged": False,
+                "light": {
+                    "flag": "unknown",
+                    "reason": Trust.unknown,
+                },
                 "playing": True,
             }
             found = await frames(client, 60)
             made = player.tick().run
-        assert found.shape == (60, 2 + 4)
-        for t, trust, *xhat in found:
+        assert found.shape == (60, 3 + 4)
+        for t, error, bound, *xhat in found:
             step = round(t / made.dt)
             np.testing.assert_array_equal(xhat, made.xhat(step))
-            assert trust == pytest.approx(made.trust(step), rel=1e-6)
+            assert np.isnan([error, bound]).all()
 
     asyncio.run(run())
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nsf.errors import ConfigError, DeviceError, InstabilityError, ShapeError
-from nsf.mpm import DomainWalls, HalfSpace, Motion, Transfer, diagnosed
+from nsf.mpm import DomainWalls, HalfSpace, Transfer, diagnosed
 from nsf.mpm.materials import DruckerPrager
 
 DX = 1.0 / 16.0
@@ -228,62 +228,3 @@ def test_a_diagnosis_looks_at_the_check_before(block, solver_of):
     calm = str(diagnosed(InstabilityError("lost"), lambda: solver_of(block), 1))
     assert "at step 0 (limit 1)" in calm
     assert "try" not in calm
-
-
-@pytest.mark.parametrize("precision", ["fp64", "fp32"])
-def test_a_resumed_run_is_the_run_itself(precision, falling_sand):
-    """Positions, velocities and stresses are enough, as an isotropic law needs no rotation of F_e."""
-    whole, resumed = falling_sand(precision), falling_sand(precision)
-    whole.step(30)
-    state = whole.state.numpy()
-    assert np.abs(state["tau"]).max() > 0.0
-    tau = 0.5 * (state["tau"] + state["tau"].transpose(0, 2, 1))
-    resumed.resume(30, state["x"], state["v"], state["C"], tau)
-    assert resumed.time == whole.time
-    whole.step(20)
-    resumed.step(20)
-    a, b = whole.state.numpy(), resumed.state.numpy()
-    tolerance = {"fp64": 1e-11, "fp32": 1e-2}[precision]
-    for name in ("x", "v", "tau"):
-        assert np.abs(a[name] - b[name]).max() < tolerance * np.abs(a[name]).max(), name
-
-
-def test_a_resumed_run_meets_its_colliders_where_they_are(block, solver_of):
-    lifted = Motion((0.0, 0.1), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)))
-    plate = HalfSpace((0.0, 0.0, 0.37), (0.0, 0.0, 1.0), "sticky", motion=lifted)
-    whole, resumed = (solver_of(block, E=100.0, colliders=[plate]) for _ in range(2))
-    whole.step(10)
-    state = whole.state.numpy()
-    resumed.resume(10, *(state[name] for name in ("x", "v", "C", "tau")))
-    whole.step(25)
-    resumed.step(25)
-    a, b = whole.state.numpy(), resumed.state.numpy()
-    assert np.abs(a["v"]).max() > 0.1
-    np.testing.assert_allclose(b["x"], a["x"], atol=1e-12)
-
-
-def test_a_state_that_cannot_be_resumed(falling_sand):
-    solver = falling_sand()
-    state = solver.state.numpy()
-    x, v, C, tau = (state[name] for name in ("x", "v", "C", "tau"))
-    with pytest.raises(InstabilityError, match="advective CFL"):
-        solver.resume(5, x, 1e3 * (1.0 + v), C, tau)
-    lost = x.copy()
-    lost[3] = 9.0
-    with pytest.raises(InstabilityError, match="particle 3 left the grid at step 5"):
-        solver.resume(5, lost, v, C, tau)
-    with pytest.raises(InstabilityError, match="stress to resume from at step 5 is not finite"):
-        solver.resume(5, x, v, C, np.full_like(tau, np.nan))
-
-
-def test_a_stress_beyond_the_law_is_scaled_down_and_counted(block, solver_of):
-    solver = solver_of(block, E=100.0)
-    state = solver.state.numpy()
-    tau = state["tau"].copy()
-    tau[4] = -1e3 * np.eye(3)
-    tau[5] = -1.0 * np.eye(3)
-    solver.resume(0, state["x"], state["v"], state["C"], tau)
-    assert solver.beyond_law == 1
-    found = solver.state.numpy()["tau"]
-    np.testing.assert_array_equal(found[5], tau[5])
-    assert -1e3 < found[4, 0, 0] < -10.0

@@ -70,7 +70,8 @@ def _rows(made: Made) -> list[dict]:
         "integration": 900.0, "particles": made.particles, "seed": made.seed, "split": "test",
         "displacement_static": 1.0, "displacement_nearest": 0.2, "displacement_interpolated": 0.05,
         "displacement_coarse": 0.3, "teach_seconds": 0.0, "fallback_share": 0.0, "distance": 1e-3,
-        "distance_max": 2e-3, "distrust": 0.5, "precision": "fp64", "device": "cpu", "commit": "1f2e3d4c5b6a",
+        "distance_max": 2e-3, "error_bound": 0.3, "flag": "green",
+        "flag_reason": "", "beyond": 0, "precision": "fp64", "device": "cpu", "commit": "1f2e3d4c5b6a",
     }  # fmt: skip
     times = {
         "step_ms_full": 6.0, "step_ms": 1.5, "step_ms_p10": 1.4, "step_ms_p90": 1.6, "step_ms_coarse": 2.0,

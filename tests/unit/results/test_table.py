@@ -118,7 +118,7 @@ def test_where_rivals_win():
 
 
 def test_every_column_has_a_meaning_and_measured_ones_a_unit():
-    pure = {"break_even_runs", "distrust"}
+    pure = {"break_even_runs"}
     assert all(column.meaning for column in COLUMNS.values())
     assert all(column.unit for column in COLUMNS.values() if column.measured and column.name not in pure)
 

@@ -214,29 +214,42 @@ test("gravity is tilted as the viewer sees it, and keeps its size", () => {
   near(tilted([0, 0, -4], camera.axes, 0, Math.PI / 6), [0, 2, -4 * Math.cos(Math.PI / 6)], 1e-9);
 });
 
-function trust() {
+function trust(changed = {}) {
   const header = {
-    parameters: [{ name: "angle", unit: "°", trained: [20, 40] }],
-    trust: { distance: 2, cases: { cases: [[20], [30], [40]], deviation: [10], spacing: 1 }, gravity: { middle: [0, 0, -4], reach: 0.5 } },
+    parameters: [{ name: "angle", unit: "°" }],
+    trust: {
+      limit: 0.2,
+      metric: [[2]],
+      reach: { names: ["angle"], box: [[20, 40]], gravity: [0, 0, -4], radius: 0.5, solids: null, states: { low: [0], high: [2], leeway: 0.1 }, changed: "" },
+      calibration: { t: [0, 1], curve: [0, 0.02], slope: 2, factor: 1.5, typical: 1, displacement: 1, errors: [0.02, 0.02], lost: 0 },
+      validated: [[30], [25]],
+      ...changed,
+    },
   };
-  const arrays = { "tube.matrix": Float64Array.of(1), "tube.scale": Float64Array.of(0.5), "tube.known": Int16Array.of(0, 20) };
-  return new Trust({ header, arrays }, { coefficientsAt: (xhat) => xhat });
+  return new Trust({ header, arrays: {} });
 }
 
-test("the light names its reason", () => {
-  const own = trust();
-  near([own.ofLatent([3]), own.ofLatent([9])], [1.5, 0.5]);
-  near([own.ofGravity([0, 0.25, -4]), own.ofCase([26]), own.ofCase([45])], [0.5, 0.4, 1.5]);
-  assert.deepEqual(own.light([30], 0.25, 0), { level: "good", text: "distrust ratio 0.25, below 1", ratio: 0.25 });
-  const why = (...given) => own.light(...given).text;
-  assert.equal(why([41], 0, 0), "distrusted: angle is outside of the training values, 20° to 40°");
-  assert.equal(why([30], 0, 2), "distrusted: gravity was 1 m/s² from that which was taught, 0.5 m/s² at most");
-  assert.equal(why([30], 1.5, 0), "distrusted: the shape left the training runs, ratio 1.50, above 1");
-  assert.equal(why([30], 0, 0, 0.2), "diverged at t = 0.2 s");
-  assert.equal(own.light([30], 0.25, 0, null, 1.9).level, "good");
-  assert.equal(why([30], 0.25, 0, null, 2.5), "the run may be 2500 mm off; training runs are 2000 mm from each other");
-  assert.equal(lightOf(0.2, 2, false, 0).level, "away");
-  assert.equal(lightOf(1.2, 2, false, 0).level, "bad");
+/** A run of two strides of 1 s whose two members are so far apart at its end. */
+function strided(apart, end = 0.5, gravity = [0, 0, -4]) {
+  const state = (x) => [{ xhat: [x - apart / 4] }, { xhat: [x + apart / 4] }];
+  return { recurrence: { stride: 1, motions: [0, 0] }, dt: 1, steps: 2, diverged: false, start: { xhat: [0] }, gravities: [gravity, gravity], states: [state(0), state(0.5), state(end)] };
+}
+
+test("the light is the bound's, and names its reason", () => {
+  // It moves by 0, 1 and 1 m: D² = 0.75 m². Members are 0.1 m apart: a signal of 0.1 / √2 m.
+  const light = (made, parameters = [30], own = trust()) => own.light(made, parameters, 2, true);
+  assert.deepEqual(light(strided(0)), { level: "green", text: "green: error 1.73 %, at most 2.6 % of the displacement" });
+  const apart = light(strided(0.1));
+  assert.equal(apart.level, "red");
+  assert.match(apart.text, /error 16.3 %, at most 24.5 % of the displacement/);
+  assert.match(light(strided(0), [35]).text, /at most 2.92 %/); // a quarter of the box away from a validation case
+  assert.equal(light(strided(0), [41]).text.split("; ")[1], "angle=41° is outside of 20 … 40");
+  assert.match(light(strided(0, 0.5, [0, 1, -4])).text, /^red: .*gravity is 1 m\/s² from that which was taught, 0.5 m\/s² at most/);
+  assert.match(light(strided(0, 2)).text, /^red: .*its shape left those of the training runs at t = 2 s/);
+  assert.equal(light({ ...strided(0), diverged: true }).level, "red");
+  assert.equal(light(strided(0), [30], trust({ calibration: null })).text, "unknown: no validation run tells");
+  assert.equal(new Trust({ header: { parameters: [] }, arrays: {} }).light(strided(0), [], 2, true).level, "unknown");
+  assert.equal(lightOf(0.05, 0.15, 0.2, "").level, "amber");
 });
 
 test("numbers as text", () => {

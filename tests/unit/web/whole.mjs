@@ -12,8 +12,7 @@ const found = live.told.cases.map((own, index) => {
   live.reset();
   live.seek(live.told.steps);
   const { xhat, parameters } = live, x = Array.from(live.deformation.at(xhat, parameters));
-  const ratios = live.run.latents.map((latent) => live.trust.ofLatent(latent));
-  return { steps: live.run.steps, xhat: Array.from(xhat), x, tau: live.stress && Array.from(live.stressOf(live.stress, null)), ratios, light: live.light() };
+  return { steps: live.run.steps, xhat: Array.from(xhat), x, tau: live.stress && Array.from(live.stressOf(live.stress, null)), light: live.light() };
 });
 const began = performance.now();
 for (let k = 0; k < 10; k++) live.run.again(live.told.steps);

@@ -1,0 +1,152 @@
+"""What the runs cover that a model was trained and taught on: outside of it no bound is promised."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nsf.recurrence.solids import FEATURES
+
+#: Of a value: what float32 may have moved it by.
+_ROUND_OFF = 1e-6
+#: Times as far as other runs went beyond the ranges that a new one of the kind may go.
+_AGAIN = 2.0
+#: Of the size of the ranges of latent states: what a run may leave them by.
+_LEAST = 0.1
+
+
+@dataclass(frozen=True)
+class Band:
+    """Ranges of numbers, and how far beyond these a run may go.
+
+    Attributes:
+        low, high: [f]; leeway: distance beyond them, over half of their width, that is allowed.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    leeway: float
+
+    @classmethod
+    def of_solids(cls, states: np.ndarray, dt: float) -> "Band":
+        """Of states [M, N, f] of solids in training runs; another may go twice as far as one of them does."""
+        rows = velocities(states, dt)
+        low, high, beyond = rows.min(1), rows.max(1), 0.0
+        for run in range(len(rows)) if len(rows) > 1 else ():
+            without = cls(np.delete(low, run, 0).min(0), np.delete(high, run, 0).max(0), 0.0)
+            off = without.each(rows[run])
+            beyond = max(beyond, float(off[np.isfinite(off)].max(initial=0.0)))
+        return cls(low.min(0), high.max(0), _AGAIN * beyond)
+
+    @classmethod
+    def of_states(cls, rows: np.ndarray, others: Sequence[np.ndarray]) -> "Band":
+        """Of latent states [K, r] [m] of training runs; others: [N, r] of validation runs."""
+        one = cls(rows.min(0), rows.max(0), 0.0)
+        off = [float(np.max(one.together(states), initial=0.0)) for states in others]
+        return cls(
+            one.low, one.high, max([_LEAST, *(_AGAIN * beyond for beyond in off if np.isfinite(beyond))])
+        )
+
+    def each(self, rows: np.ndarray) -> np.ndarray:
+        """[..., f] how far each number is beyond its range, over half of the range; 0 inside."""
+        beyond, half = self._beyond(rows), 0.5 * (self.high - self.low)
+        varies = half > self._slack
+        return np.divide(beyond, half, out=np.where(beyond > 0.0, np.inf, 0.0), where=varies)
+
+    def together(self, rows: np.ndarray) -> np.ndarray:
+        """[...] how far rows [..., f] of one unit are beyond, over half of the diagonal."""
+        half = 0.5 * float(np.linalg.norm(self.high - self.low))
+        return np.linalg.norm(self._beyond(rows), axis=-1) / (half or 1.0)
+
+    def _beyond(self, rows: np.ndarray) -> np.ndarray:
+        off = np.maximum(self.low - self._slack - rows, rows - self.high - self._slack)
+        return np.where(np.isnan(off), np.inf, np.maximum(off, 0.0))
+
+    @property
+    def _slack(self) -> np.ndarray:
+        """[f] what round-off may move the numbers by."""
+        return _ROUND_OFF * np.maximum(np.abs(self.low), np.abs(self.high))
+
+    def plain(self) -> dict:
+        """Plain containers."""
+        return {"low": self.low.tolist(), "high": self.high.tolist(), "leeway": self.leeway}
+
+    @classmethod
+    def read(cls, content: Mapping) -> "Band":
+        """From plain containers."""
+        return cls(
+            np.asarray(content["low"], float), np.asarray(content["high"], float), float(content["leeway"])
+        )
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Parameters, forcing and latent states of the runs that a model learned from.
+
+    Attributes:
+        names, box: [n, 2] ranges of the problem parameters.
+        gravity: [3] middle of all gravity [m/s²]; radius: how far from it any was [m/s²].
+        solids: states of the solids that programs move; None where they move none.
+        states: latent states in metres (`Trust.metric`).
+        changed: in what the deployed scene differs from that of training; empty where it does not.
+    """
+
+    names: tuple[str, ...]
+    box: np.ndarray
+    gravity: np.ndarray
+    radius: float
+    solids: Band | None
+    states: Band
+    changed: str = ""
+
+    def of_inputs(
+        self, values: Mapping[str, float], gravity: np.ndarray, solids: np.ndarray, dt: float
+    ) -> str:
+        """Why the inputs of a run are outside; empty where they are not.
+
+        Args:
+            values: of the parameters, by name.
+            gravity: [N, 3] in its course [m/s²]; solids: [N, f] states of the colliders, in steps of dt [s].
+        """
+        if self.changed:
+            return f"deploy.changes has {self.changed}, which no training run had"
+        for name, (low, high) in zip(self.names, self.box.tolist(), strict=True):
+            slack = _ROUND_OFF * max(abs(low), abs(high))
+            if not low - slack <= values[name] <= high + slack:
+                return f"{name}={values[name]:g} is outside of {low:g} … {high:g}"
+        away = float(np.linalg.norm(np.asarray(gravity) - self.gravity, axis=-1).max(initial=0.0))
+        if away > self.radius + _ROUND_OFF * (self.radius + float(np.linalg.norm(self.gravity))):
+            return f"gravity is {away:.3g} m/s² from that which was taught, {self.radius:.3g} m/s² at most"
+        if self.solids is not None and (self.solids.each(velocities(solids, dt)) > self.solids.leeway).any():
+            return "a solid is where, or as fast as, no program of training moves it"
+        return ""
+
+    def of_states(self, rows: np.ndarray) -> np.ndarray:
+        """[...] whether latent states [..., r] [m] are outside."""
+        return self.states.together(rows) > self.states.leeway
+
+    def plain(self) -> dict:
+        """Plain containers."""
+        return {
+            "names": list(self.names), "box": self.box.tolist(), "gravity": self.gravity.tolist(),
+            "radius": self.radius, "solids": None if self.solids is None else self.solids.plain(),
+            "states": self.states.plain(), "changed": self.changed,
+        }  # fmt: skip
+
+    @classmethod
+    def read(cls, content: Mapping) -> "Reach":
+        """From plain containers."""
+        solids = content["solids"]
+        return cls(
+            tuple(map(str, content["names"])), np.asarray(content["box"], float).reshape(-1, 2),
+            np.asarray(content["gravity"], float), float(content["radius"]),
+            None if solids is None else Band.read(solids), Band.read(content["states"]),
+            str(content["changed"]),
+        )  # fmt: skip
+
+
+def velocities(states: np.ndarray, dt: float) -> np.ndarray:
+    """States [..., f] of solids with velocities in place of changes in a step of dt [s]."""
+    rows = states.reshape(*states.shape[:-1], -1, FEATURES).copy()
+    rows[..., 4:8] /= dt
+    return rows.reshape(states.shape)

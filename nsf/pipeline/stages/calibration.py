@@ -1,0 +1,124 @@
+"""What bounds the errors of a pipeline's runs: its runs of validation cases, held to their full-order runs.
+
+These runs are a deployment of their own, made once for a model and used again. They are compared at a few
+hundred particles and some fifty frames.
+"""
+
+import contextlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from nsf.data import Case, Trajectory
+from nsf.data.schema import TRAJECTORY
+from nsf.deployment import Band, Calibration, Reach, Rollout, Trust, rollout_file
+from nsf.deployment.bound import rms
+from nsf.kinematics.manifold import Manifold
+from nsf.models.drawn import Drawn
+from nsf.pipeline.stages.encoding import encoded_runs
+from nsf.recurrence.solids import collider_states
+from nsf.vectors import spaced
+
+_PARTICLES, _FRAMES = 500, 51
+
+
+def calibrated(pipeline, manifold: Manifold) -> Trust:
+    """What bounds the errors of a pipeline's runs.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`, whose validation cases are deployed (`Pipeline.validating`).
+        manifold: trained fields.
+
+    Raises:
+        MissingRunError: they are not deployed, or the full-order run of one is gone.
+    """
+    trust = Trust.of(manifold, 0.01 * pipeline.config.trust.limit)
+    validating = pipeline.validating
+    rollouts = [] if validating is None else _rollouts(validating, manifold)
+    reach = _reach(pipeline, manifold, trust, rollouts)
+    if not rollouts:
+        at_validation = pipeline.config.deploy.split == "validation"
+        trust = Trust.of(manifold, trust.limit, reach)
+        trust.unknown = "validation cases say how large errors are" if at_validation else Trust.unknown
+        return trust
+    calibration = _calibration(validating, manifold, trust, rollouts)
+    return trust.calibrated(reach, [rollout.case.parameters for rollout in rollouts], calibration)
+
+
+def _rollouts(validating, manifold: Manifold) -> list[Rollout]:
+    run, count = validating.deployment.require(), len(validating.held_out)
+    return [Rollout.open(run.file(rollout_file(index)), manifold.latent_dim) for index in range(count)]
+
+
+def _calibration(validating, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Calibration:
+    """Errors of runs of validation cases, beside what these runs say of themselves."""
+    particles = np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_PARTICLES])
+    at = manifold.restrict(torch.as_tensor(particles), device=manifold.X.device)
+    rows = []
+    for rollout in rollouts:
+        with contextlib.closing(
+            Trajectory.open(validating.truth(rollout.case).require().file(TRAJECTORY))
+        ) as truth:
+            frames = spaced(truth.frames, _FRAMES)
+            t = truth.t[frames]
+            x = truth.read("x", frames=frames.tolist(), particles=particles)
+            X = truth.X[particles]
+        with torch.no_grad():
+            xhat = torch.as_tensor(_at(t, rollout.t, rollout.xhat)).to(at.device, at.dtype)
+            off = at.position(xhat).double().cpu().numpy() - x
+        errors = np.sqrt(np.square(off).sum(2).mean(1))
+        if rollout.diverged >= 0:
+            errors[:] = np.inf
+        moved = np.sqrt(np.square(x - X).sum(2).mean(1))
+        signal = np.interp(t, rollout.t, rollout.signal)
+        rows.append((errors, moved, signal, np.full(len(t), rms(trust.moved(rollout.xhat)))))
+    return Calibration.of(t, *(np.stack(values) for values in zip(*rows, strict=True)))
+
+
+def _at(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows [n, q] at times [n], at other times t [F], linear between them."""
+    return np.stack([np.interp(t, times, column) for column in rows.T], axis=1)
+
+
+def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Reach:
+    """What was taught: parameters, forcing, and latent states of training runs, and of drawn ones."""
+    scene, model = pipeline.scene, pipeline.model
+    parameters = manifold.training_parameters.double().cpu().numpy()
+    latents = manifold.training_latents.double().cpu().numpy()
+    radius, solids = 0.0, None
+    if scene.forcing.colliders:
+        runs = [scene.at(case).solids for case in pipeline.split.train]
+        solids = np.stack([collider_states(run, scene.dt, scene.steps) for run in runs])
+    if isinstance(model, Drawn):
+        radius = model.gravity * float(np.linalg.norm(scene.gravity))
+        if pipeline.encoding.complete:
+            lessons = encoded_runs(pipeline, manifold)
+            latents = np.concatenate([latents, lessons.xhat.reshape(-1, latents.shape[1])])
+            solids = solids if solids is None else lessons.inputs.solids
+    if scene.forcing.gravity:
+        radius = scene.forcing.reach(scene.base_gravity)
+    return Reach(
+        names=tuple(manifold.parameter_names),
+        box=np.stack([parameters.min(0), parameters.max(0)], 1),
+        gravity=np.asarray(scene.base_gravity, float),
+        radius=radius,
+        solids=None if solids is None else Band.of_solids(solids, scene.dt),
+        states=Band.of_states(latents @ trust.metric, [rollout.xhat @ trust.metric for rollout in rollouts]),
+        changed=", ".join(pipeline.config.deploy.changes or ()),
+    )
+
+
+def beyond(pipeline, trust: Trust, case: Case, encoded: np.ndarray) -> bool:
+    """Whether a case leads beyond what was taught, by its inputs or by the states of its full-order run.
+
+    Args:
+        pipeline: whose deployment it is; trust: of that.
+        case: of the run.
+        encoded: [F, r] latent vectors of the full-order frames.
+    """
+    scene = pipeline.deployed.at(case)
+    solids = collider_states(scene.solids, scene.dt, scene.steps)
+    gravity = scene.acting_gravity.at(scene.dt * np.arange(scene.steps))
+    outside = trust.reach.of_inputs(case.parameters, gravity, solids, scene.dt)
+    return bool(outside) or bool(trust.reach.of_states(encoded @ trust.metric).any())

@@ -1,0 +1,87 @@
+"""Models that are wrong on purpose are red or amber, and the bound of a good one holds."""
+
+import pandas as pd
+import pytest
+
+from nsf.deployment import TRUST, Trust
+
+VALIDATED = ("scene.design.validation=[24,34]", "scene.design.test=[26,36]")
+UNTIMED = ("evaluation.trials=0", "evaluation.coarse=[]")
+STAGES = ("simulate", "train", "teach", "deploy", "evaluate")
+QUICK = ("model=recurrence", "model.runs=4", "model.descents=2", "model.width=8", "model.members=2")
+
+
+@pytest.fixture(scope="module")
+def root(chain, tmp_path_factory):
+    return tmp_path_factory.mktemp("trust") / "runs"
+
+
+@pytest.fixture
+def rows(pipeline_at, root):
+    """Overrides → the pipeline, its rows and what it said."""
+
+    def run(*overrides):
+        said = []
+        pipeline = pipeline_at(root, *UNTIMED, *VALIDATED, *overrides, say=said.append)
+        for stage in STAGES:
+            if stage in pipeline.stages:
+                pipeline.run(stage)
+        return pipeline, pd.read_csv(pipeline.evaluation.file("results.csv")), said
+
+    return run
+
+
+@pytest.mark.parametrize("model", ["projected", "interpolate"])
+def test_a_good_model_is_green_and_its_bound_holds(rows, model):
+    pipeline, table, said = rows(f"model={model}")
+    assert table["flag"].tolist() == ["green", "green"]
+    assert (table["error_bound"] >= table["displacement_error"]).all()
+    assert (table["error_bound"] <= 5.0 * table["displacement_error"]).all()
+    assert any(line.startswith("deploy: friction_angle=26°: green: error ") for line in said)
+    assert pipeline.validating.deployment.id in pipeline.deployment.parents
+    trust = Trust.open(pipeline.deployment.file(TRUST), pipeline.manifold())
+    assert trust.calibration.errors.shape == (2,)
+
+
+def test_validation_runs_are_made_once(rows):
+    rows("model=interpolate")
+    _, _, said = rows("model=interpolate", "scene.design.test=[27]")
+    assert any("deploy: inputs unchanged, reused" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ("stress=deformation", "affine=none"),
+        ("latent_dim=1", "sampler.size=5"),
+        ("scene.design.train=[37,38]",),
+        ("deploy.changes={material.nu:0.1}",),
+        ("deploy.changes={scene.gravity:[0,0,-14]}",),
+        ("scene.design.test=[50,55]",),
+        QUICK,
+    ],
+    ids=["baseline", "one coordinate", "two training runs", "another law", "gravity", "55°", "untrained"],
+)
+def test_what_is_wrong_on_purpose_is_red_or_amber(rows, wrong):
+    _, table, _ = rows(*wrong)
+    assert set(table["flag"]) <= {"red", "amber"}
+
+
+def test_one_validation_run_gives_a_coarse_bound(rows):
+    _, table, _ = rows("model=interpolate", "scene.design.validation=[30.5]")
+    assert table["flag_reason"].tolist() == ["the bound is coarse, of one validation run"] * 2
+    assert (table["error_bound"] >= table["displacement_error"]).all()
+
+
+def test_validation_cases_in_a_corner(rows):
+    """The bound is wider the further away a case is, and holds in the other corner."""
+    _, table, _ = rows("scene.design.validation=[22.5,23.5]", "scene.design.test=[25,37]")
+    assert (table["error_bound"] >= table["displacement_error"]).all()
+    assert table["error_bound"][1] > table["error_bound"][0]
+
+
+def test_a_red_run_is_taken_whole_by_the_fallback(rows):
+    _, table, said = rows(*QUICK, "fallback=projected")
+    assert table["fallback_share"].tolist() == [1.0, 1.0]
+    assert table["flag"].tolist() == ["green", "green"]  # those of the projected runs
+    assert any("goes to projected, since recurrence is red" in line for line in said)
