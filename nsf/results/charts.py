@@ -125,7 +125,7 @@ def programs(view: View) -> Figures:
         return {}
     groups = list(forced.groupby("body", sort=False))
     most = max(part["variant"].nunique() for _, part in groups) + len(RIVALS)
-    fig, drawn = panels(len(groups), 0.5 + 0.27 * most, 2)
+    fig, drawn = panels(len(groups), max(3.0, 0.6 + 0.27 * most), 2)
     for panel, (body, part) in zip(drawn, groups, strict=True):
         rows = {
             name: _of_programs(one["displacement_error"], one)
@@ -152,11 +152,13 @@ def _of_programs(errors: pd.Series, part: pd.DataFrame) -> np.ndarray:
 
 def _dots(panel, y: int, errors: np.ndarray, color: str) -> None:
     """Errors [%] as dots in a row, with their median; those beyond the axis at its end."""
+    if not len(errors):  # an empty line that is not clipped has a box without end
+        return
     edge = panel.get_xlim()[1]
     panel.plot(
         np.minimum(errors, edge), np.full(len(errors), y), "o", ms=4.5, mfc="white", mec=color, clip_on=False
     )
-    if len(errors) and (middle := np.median(errors)) <= edge:
+    if (middle := np.median(errors)) <= edge:
         panel.plot([middle] * 2, [y - 0.34, y + 0.34], color=color, lw=2.4)
 
 
