@@ -124,7 +124,7 @@ class Trust:
         unknown: why nothing is told, where nothing is.
     """
 
-    unknown = "no validation run tells; set scene.design.validation"
+    unknown = "no validation run tells (set scene.design.validation)"
 
     def __init__(
         self,

@@ -102,10 +102,9 @@ def _maps(view: View, planes: list) -> Figure:
 def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
     """Bodies whose cases have several values: their rows with a column a parameter, and these names.
 
-    Errors are means over seeds, a row a case and variant, but for variants that the fallback took whole.
+    Errors are means over seeds, a row a case and variant, but for runs that the fallback took.
     """
-    share = view.frame["fallback_share"].fillna(0).groupby([view.frame["body"], view.frame["variant"]])
-    shown = view.frame[share.transform("min") < 1]
+    shown = view.frame[view.frame["fallback_share"].fillna(0) == 0]
     for body, part in shown.groupby("body", sort=False):
         try:
             cases = {text: Case.read(text) for text in part["case"].unique()}

@@ -28,6 +28,7 @@ from nsf.results.columns import (
 from nsf.results.folder import MARK, replaced
 from nsf.results.formats import Rows, latex_table, spreadsheet
 from nsf.results.page import Page, Picture, Section, Table, html_page, markdown_page
+from nsf.results.promise import BAD, GOOD, judged, promise
 from nsf.results.question import Question, made_of, plain
 from nsf.results.sources import KEPT, Source, checked_hash, file_hash, open_sources
 from nsf.results.style import save
@@ -53,7 +54,7 @@ _EACH = (
 _PASSING = ("evaluation.", "data.", "super_resolution.", "report.")  # keys that tell no models apart
 _OF_COLUMNS = ("case", "latent_dim", "model", "stress", "affine", "field", "seed", "precision", "device")
 _MOST = 3  # keys by which runs without an experiment are told apart
-_FEW = 5  # rows from which a rank correlation says anything
+_FEW = 5  # runs from which shares of them say anything
 _FINE = "superresolution.csv"
 _NOTE = (
     "results.csv holds every row in full precision with its run; sources.json names the origin of "
@@ -259,7 +260,7 @@ def write_pages(
             *_facts(view.frame),
         ],
         warnings=list(warnings),
-        tables=[first, *more, Table("Each case", each, _promise(view.frame))],
+        tables=[first, *more, *_bounds(view.frame), Table("Each case", each, "")],
         sections=[section for section in sections if section.pictures],
         provenance=Table("Where the numbers come from", provenance_rows(runs), _NOTE),
         definitions=definitions(used),
@@ -370,16 +371,13 @@ def _averages_of(frame: pd.DataFrame) -> str:
     )
 
 
-def _promise(frame: pd.DataFrame) -> str:
-    """How many runs keep their error bound, and how its ranks agree with those of the errors."""
-    rows = frame[frame["fallback_share"].fillna(0) == 0].dropna(subset=["error_bound", "displacement_error"])
-    if len(rows) < _FEW:
-        return ""
-    bound, error = rows["error_bound"], rows["displacement_error"]
-    return (
-        f"The error bound holds in {100 * (bound >= error).mean():.0f} % of {len(rows)} runs; Spearman's "
-        f"rank correlation of bound and error is {bound.rank().corr(error.rank()):.2f}."
-    )
+def _bounds(frame: pd.DataFrame) -> list[Table]:
+    """Whether error bounds held, a row a body and model; none of few runs."""
+    if len(judged(frame)) < _FEW:
+        return []
+    off = f"more than {100 * BAD:.0f} % off; false alarms: red, and less than {100 * GOOD:.0f} % off."
+    note = f"Missed: green, and {off}"
+    return [Table("Error bounds", table.rows_of(promise(frame), list(promise(frame))), note)]
 
 
 def _warnings(sources: Sequence[Source]) -> list[str]:

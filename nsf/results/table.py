@@ -56,6 +56,8 @@ _TELLING = ("variant", "case", "cases", "paper_delta")  # shown where they vary
 _DRAWS = 10_000  # of seeds and cases, for the interval of a mean
 BEYOND = " (programs beyond what was taught)"
 """Ends the variant of rows whose program led beyond what was taught; no mean of the others counts them."""
+TAKEN = " (taken by the fallback)"
+"""Ends the variant of rows whose runs another model took, likewise."""
 DEVIATION = ", deviation"
 """Ends the names of columns of `means` that have the deviation over seeds."""
 
@@ -180,6 +182,8 @@ def labelled(frame: pd.DataFrame) -> pd.DataFrame:
     frame["model_name"] = [model_name(row) for row in frame.to_dict("records")]
     frame["variant"] = variants(frame)
     frame.loc[_beyond(frame), "variant"] += BEYOND
+    taken = (frame["fallback_share"].fillna(0) > 0) & (frame["model"] != "full")
+    frame.loc[taken, "variant"] += TAKEN
     # Both errors of a run divide one distance, so that their ratio is of the full-order run alone.
     ratio = (frame["delta"] / frame["displacement_error"]).groupby([frame["body"], frame["case"]])
     ratio = ratio.transform("median")

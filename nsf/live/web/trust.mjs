@@ -87,7 +87,7 @@ export class Trust {
     const seen = looks.slice(0, last + 1), diverged = run.diverged && step >= run.steps;
     const reason = this._outside(parameters, Math.max(...seen.map(({ gravity }) => gravity)), seen.findIndex(({ left }) => left) * stride * run.dt);
     const { calibration, limit } = told, more = reason || (diverged ? `it diverged at t = ${quantity(step * run.dt, "s")}` : "");
-    if (!calibration) return lightOf(NaN, NaN, limit, more || "no validation run tells", reason || diverged ? "red" : null);
+    if (!calibration) return lightOf(NaN, NaN, limit, more || "no validation run tells (set scene.design.validation)", reason || diverged ? "red" : null);
     const own = rms(seen.map(({ moved }) => moved)), D = whole ? own : Math.max(own, calibration.displacement);
     const base = seen.map(({ signal }, k) => Math.max(D * between(calibration.t, calibration.curve, k * stride * run.dt), calibration.slope * signal));
     const expected = D > 0 ? (this._away(parameters) * rms(base)) / D : 0, of = (/** @type {number | null} */ factor) => (diverged ? Infinity : expected * (factor ?? Infinity));

@@ -141,7 +141,7 @@ def test_a_lost_run_is_red():
 
 def test_without_validation_runs_nothing_is_known():
     verdict = trust(reach()).judge({"E": 2.0}, T, LATENTS, 0.0 * T)
-    assert verdict.text == "unknown: no validation run tells; set scene.design.validation"
+    assert verdict.text == "unknown: no validation run tells (set scene.design.validation)"
     assert trust(reach()).judge({"E": 2.0}, T, LATENTS, 0.0 * T, diverged=3).flag == "red"
 
 

@@ -247,7 +247,7 @@ test("the light is the bound's, and names its reason", () => {
   assert.match(light(strided(0, 0.5, [0, 1, -4])).text, /^red: .*gravity is 1 m\/s² from that which was taught, 0.5 m\/s² at most/);
   assert.match(light(strided(0, 2)).text, /^red: .*its shape left those of the training runs at t = 2 s/);
   assert.equal(light({ ...strided(0), diverged: true }).level, "red");
-  assert.equal(light(strided(0), [30], trust({ calibration: null })).text, "unknown: no validation run tells");
+  assert.equal(light(strided(0), [30], trust({ calibration: null })).text, "unknown: no validation run tells (set scene.design.validation)");
   assert.equal(new Trust({ header: { parameters: [] }, arrays: {} }).light(strided(0), [], 2, true).level, "unknown");
   assert.equal(lightOf(0.05, 0.15, 0.2, "").level, "amber");
 });

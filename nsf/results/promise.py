@@ -1,0 +1,90 @@
+"""Whether error bounds held: rows of results as a table, a row a body and model, and as a chart."""
+
+import numpy as np
+import pandas as pd
+
+from nsf.results.charts import ERROR, Figures, View, chart
+from nsf.results.columns import COLUMNS
+from nsf.results.style import INK, LOST, MUTED, PALETTE, legend, panels, plain_ticks
+
+#: Displacement errors above which a run ought not to be green, and below which it ought not to be red.
+BAD, GOOD = 0.2, 0.05
+_MULTIPLES = np.geomspace(0.1, 4.0, 60)  # of the bound
+
+
+def judged(frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows with a bound of the model that took the run from its beginning."""
+    rows = frame.dropna(subset=["error_bound", "displacement_error"])
+    return rows[rows["fallback_share"].fillna(0) == 0]
+
+
+def promise(frame: pd.DataFrame) -> pd.DataFrame:
+    """Coverage, sharpness and flags of error bounds, a row a body and model, and one of all.
+
+    Args:
+        frame: as `nsf.results.table.labelled` gives it.
+
+    Returns:
+        Columns `body`, `model_name`; `runs`; `holds`: share of runs within what was taught whose error is at
+        most its bound; `sharpness`: median of bound over error; `rank`: Spearman's correlation of both;
+        `missed`: of runs more than `BAD` off, the share that is green; `false_alarms`: of runs less than
+        `GOOD` off, the share that is red.
+    """
+    rows = judged(frame)
+    parts = [(*key, part) for key, part in rows.groupby(["body", "model_name"], sort=False)]
+    if len(parts) > 1:
+        parts.append(("all", "", rows))
+    return pd.DataFrame([{"body": body, "model_name": name} | _of(part) for body, name, part in parts])
+
+
+def _of(rows: pd.DataFrame) -> dict[str, float]:
+    bound, error = rows["error_bound"], rows["displacement_error"]
+    finite = np.isfinite(error) & np.isfinite(bound) & (error > 0)
+    varies = error.nunique() > 1 and bound.nunique() > 1
+    return {
+        "runs": len(rows),
+        "holds": _share((bound >= error)[_within(rows)]),
+        "sharpness": (bound[finite] / error[finite]).median(),
+        "rank": bound.rank().corr(error.rank()) if varies else np.nan,
+        "missed": _share(rows["flag"].eq("green")[error > BAD]),
+        "false_alarms": _share(rows["flag"].eq("red")[error < GOOD]),
+    }
+
+
+def _within(rows: pd.DataFrame) -> pd.Series:
+    """Whether a row's case led nowhere beyond what was taught, so that a bound is promised."""
+    return rows["beyond"].fillna(0) == 0
+
+
+def _share(held: pd.Series) -> float:
+    return float(held.mean()) if len(held) else np.nan
+
+
+@chart(
+    "Left: displacement error of each held-out run beside its error bound; below the line the bound holds. "
+    "Right: share of runs whose error is at most a multiple of its bound; at 1 it ought to be nine tenths."
+)
+def error_bounds(view: View) -> Figures:
+    """Error over bound of every run, and how often multiples of the bound hold."""
+    rows = judged(view.frame)
+    rows = rows[np.isfinite(rows["error_bound"]) & (rows["error_bound"] > 0)]
+    if rows["error_bound"].nunique() < 2:
+        return {}
+    fig, (beside, holds) = panels(2, 3.4, 2)
+    ends = [100 * rows["error_bound"].min() / 2, min(200 * rows["error_bound"].max(), LOST)]
+    for i, (body, part) in enumerate(rows.groupby("body", sort=False)):
+        errors = np.clip(100 * part["displacement_error"], ends[0], ends[1])
+        style = {"color": PALETTE[i % len(PALETTE)], "label": body, "alpha": 0.7}
+        beside.plot(np.minimum(100 * part["error_bound"], ends[1]), errors, "o", ms=3.5, mew=0, **style)
+    beside.plot(ends, ends, color=INK, lw=1.0)
+    beside.set(xscale="log", yscale="log", xlabel=COLUMNS["error_bound"].heading, ylabel=ERROR)
+    beside.set(xlim=ends, ylim=ends)
+    plain_ticks(beside.xaxis), plain_ticks(beside.yaxis)
+    within = rows[_within(rows)]
+    ratios = (within["displacement_error"] / within["error_bound"]).to_numpy()
+    holds.plot(_MULTIPLES, [100 * np.mean(ratios <= multiple) for multiple in _MULTIPLES], color=INK)
+    holds.axvline(1.0, color=MUTED, lw=0.8), holds.axhline(90.0, color=MUTED, lw=0.8)
+    holds.set(xscale="log", xlabel="multiple of the bound [–]", ylabel="runs below it [%]", ylim=(0, 102))
+    plain_ticks(holds.xaxis)
+    legend(fig)
+    return {"error-bounds": fig}
