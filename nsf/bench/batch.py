@@ -5,7 +5,7 @@ from functools import partial
 
 import torch
 
-from nsf.bench.measure import build, run_times
+from nsf.bench.measure import WholeRun, build, turns
 from nsf.bench.reduced import deformation_error, pipelines, prepared
 from nsf.bench.rows import Case, Measurements
 from nsf.data import Case as Parameters
@@ -46,14 +46,15 @@ def measured(chain: Pipeline, sizes: Sequence[int], figures: Measurements, end: 
                 figures.say(f"reduced_batch{size}{end} {precision}: left out, the device has not the memory")
                 break
             built[size] = build(partial(make, size, precision), settings.device)
-        times = run_times({n: solver for n, (solver, _) in built.items()}, settings.trials, settings.device)
+        sides = {n: WholeRun(solver, scene.steps) for n, (solver, _) in built.items()}
+        times = turns(sides, settings.trials, settings.device)
         for size, (solver, peak) in built.items():
             run = solver.runs[0]
             case = Case(
                 bench="batch", name=f"reduced_batch{size}{end}", particles=len(manifold.X), batch=size,
                 sample=run.sample_size, integration=round(run.integration_mean), precision=precision,
             )  # fmt: skip
-            ms = figures.add(case, "step", times[size] / size)
+            ms = figures.add(case, "step", times[size] / size / scene.steps)
             figures.add(case, "peak memory", peak, "MiB")
             delta = figures.add(case, "δ", deformation_error(run, truth), "1")
             error = f"δ {100 * delta:.3g} %"

@@ -2,8 +2,12 @@
 
 import gc
 import itertools
+import math
+import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -45,7 +49,7 @@ def peak_mib(call: Callable[[], object], device: str, nbytes: int | Callable[[],
 
 
 def window_times(
-    solvers: Mapping[str, object], total: int, trials: int, device: str, whole: Mapping[str, object] = {}
+    solvers: Mapping[str, object], total: int, trials: int, device: str
 ) -> dict[str, np.ndarray]:
     """[trials] mean time of a step [ms] in windows spread over a run, the same of every solver, in turns.
 
@@ -54,41 +58,70 @@ def window_times(
         total: steps of the run, more than the warm-up's.
         trials: windows; fewer where there are not so many steps.
         device: of all.
-        whole: others by name, each of which takes a whole run in every turn; as for `run_times`.
     """
-    wait, taken = synchronizer(device), {name: [] for name in (*solvers, *whole)}
-    for solver in whole.values():
-        _whole_run(solver, wait)
+    wait, taken = synchronizer(device), {name: [] for name in solvers}
     edges = np.unique(np.linspace(WARM_UP, total, trials + 1).round().astype(int)).tolist()
     for start, end in itertools.pairwise(edges):
         steps = min(end - start, WINDOW)
         for name, solver in solvers.items():
             solver.step(start - solver.steps_taken)
             taken[name].append(elapsed_ms(partial(solver.step, steps), wait) / steps)
-        for name, solver in whole.items():
-            taken[name].append(_whole_run(solver, wait))
     return {name: np.array(times) for name, times in taken.items()}
 
 
-def run_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:
-    """[trials] mean time of a step [ms] over whole runs of each solver from t = 0, turn by turn.
+@dataclass
+class WholeRun:
+    """A run of a solver from t = 0 to its end.
 
-    A solver that has an end is restarted before each; its first run, which compiles, loads and captures, is
-    left out.
+    Attributes:
+        solver: with `restart` and `step`.
+        steps: of the run.
     """
-    wait, taken = synchronizer(device), {name: [] for name in solvers}
+
+    solver: Any
+    steps: int
+
+    def restart(self) -> None:
+        """Go back to t = 0."""
+        self.solver.restart()
+
+    def run(self) -> None:
+        """Take every step."""
+        self.solver.step(self.steps)
+
+
+def taught(chain) -> None:
+    """Make, or reuse, all that runs by the recurrence of a `nsf.pipeline.Pipeline` need, and their bounds."""
+    chain.simulate(("train",))
+    chain.train()
+    chain.teach()
+    for other in chain.calibrating:
+        other.deploy()
+
+
+def turns(
+    sides: Mapping[Any, WholeRun], trials: int, device: str, limit: float = math.inf
+) -> dict[Any, np.ndarray]:
+    """[trials] time of whole runs [ms] of each side, turn by turn.
+
+    The first run of each, which compiles, loads and captures, is left out.
+
+    Args:
+        sides: by name.
+        trials: of each.
+        device: of all.
+        limit: [s] after which no further turn begins.
+    """
+    wait, taken, begun = synchronizer(device), {name: [] for name in sides}, time.perf_counter()
     for trial in range(trials + 1):
-        for name, solver in solvers.items():
-            ms = _whole_run(solver, wait)
+        for name, side in sides.items():
+            side.restart()
+            ms = elapsed_ms(side.run, wait)
             if trial:
                 taken[name].append(ms)
+        if trial and time.perf_counter() - begun > limit:
+            break
     return {name: np.array(times) for name, times in taken.items()}
-
-
-def _whole_run(solver, wait: Callable[[], object]) -> float:
-    """Mean time of a step [ms] of a run from t = 0 to its end."""
-    solver.restart()
-    return elapsed_ms(lambda: solver.step(solver.total_steps), wait) / solver.total_steps
 
 
 def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:

@@ -1,16 +1,14 @@
-"""A step by a recurrence beside the full-order one: single runs, and many at once."""
+"""Many runs by a recurrence at once: the time of a step of one of them."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from nsf import config
-from nsf.bench.measure import build, run_times, window_times
-from nsf.bench.reduced import deformation_error, error_of_latents, scenes
+from nsf.bench.measure import WholeRun, build, taught, turns
+from nsf.bench.reduced import error_of_latents
 from nsf.bench.rows import Case, Measurements
 from nsf.data import Case as Parameters
 from nsf.data.schema import TRAJECTORY
@@ -21,114 +19,52 @@ from nsf.recurrence.descent import of_strides
 from nsf.recurrence.engine import between
 
 #: Runs at once, and the scene that they are of.
-MANY, OF_MANY = 1024, "metal"
+MANY, SCENE = 1024, "metal"
 
 
 def run(figures: Measurements) -> None:
-    """Each scene, and 1 024 runs of `metal` at once: at the paper's size on a GPU, at small scale on a CPU.
+    """1 024 runs of `metal`, at the paper's size on a GPU, at small scale on a CPU.
 
     Data, training and teaching are made, or reused, as by `nsf teach model=recurrence`.
     """
-    for scene in scenes(figures):
-        measured(_chain(scene, figures), figures, MANY if scene == OF_MANY else 0)
-
-
-def _chain(scene: str, figures: Measurements) -> Pipeline:
-    keys = [f"scene={scene}", f"scale={figures.settings.scale}", f"device={figures.settings.device}"]
-    return Pipeline(config.load([*keys, "model=recurrence"]), say=figures.say)
-
-
-def measured(chain: Pipeline, figures: Measurements, many: int = 0) -> None:
-    """Add the rows of one scene in its first held-out case.
-
-    Args:
-        chain: of the scene, with `model=recurrence`.
-        figures: as for `run`.
-        many: runs at once, in rows of their own; 0 for none.
-    """
-    chain.simulate(("train",))
-    chain.train()
-    chain.teach()
-    manifold, truth = chain.manifold(), chain.truth(chain.held_out[0]).path / TRAJECTORY
-    for precision in figures.settings.precisions:
-        full_ms, case, run = _compared(chain, manifold, precision, truth, figures)
-        if many:
-            _together(run, chain, many, full_ms, case, truth, figures)
+    settings = figures.settings
+    keys = [f"scene={SCENE}", f"scale={settings.scale}", f"device={settings.device}", "model=recurrence"]
+    chain = Pipeline(config.load([*keys, *settings.keys]), say=figures.say)
+    taught(chain)
+    measured(chain, MANY, figures)
 
 
 @torch.no_grad()
-def _compared(
-    chain: Pipeline, manifold, precision: str, truth: Path, figures: Measurements
-) -> tuple[float, Case, ReducedMPM]:
-    """Add the rows of either solver in one precision, turn by turn.
+def measured(chain: Pipeline, count: int, figures: Measurements) -> None:
+    """Add the row of each precision.
+
+    The first run is that of the first held-out case, of which δ is told; the others fill the box of training.
 
     Args:
-        chain, manifold: whose recurrence is run.
-        precision, truth, figures: of the rows.
-
-    Returns:
-        Time of a full-order step [ms], the case of the run by recurrence, and that run at its end.
-    """
-    settings, device = figures.settings, figures.settings.device
-    scene, held_out = chain.scene, chain.held_out[0]
-    full, full_peak = build(partial(scene.full_order, held_out, precision, device), device)
-    run, peak = build(partial(chain.solver_at, manifold, held_out, precision=precision), device)
-    times = window_times({"full": full}, scene.steps, settings.trials, device, whole={"own": run})
-    of = partial(Case, bench="recurrence", particles=scene.particle_count, precision=precision)
-    case = of(name=f"full_order_{scene.name}")
-    full_ms = figures.add(case, "step", times["full"])
-    figures.add(case, "peak memory", full_peak, "MiB")
-    case = of(name=f"recurrence_{scene.name}", sample=run.sample_size)
-    delta = deformation_error(run, truth)
-    _add_run(figures, case, times["own"], full_ms, delta, run.nbytes, peak, chain.taught)
-    return full_ms, case, run
-
-
-def _add_run(
-    figures: Measurements, case: Case, ms, full_ms: float, delta: float, nbytes: int, peak, teaching
-):
-    """Add the figures of runs by a recurrence, alone or many at once."""
-    own = figures.add(case, "step", ms)
-    figures.add(case, "peak memory", peak, "MiB")
-    figures.add(case, "δ", delta, "1")
-    ratio = figures.add(case, "speed-up", full_ms / own, "1")
-    memory = figures.add(case, "memory of a run", nbytes / 2**20, "MiB")
-    figures.add(case, "teaching", teaching.metric("teach_seconds"), "s")
-    figures.add(case, "runs that taught it", teaching.metric("runs"), "1")
-    figures.say(
-        f"{case.name} {case.precision}: {own:.4g} ms a {'simulation-' * (case.batch > 1)}step, {ratio:.4g} "
-        f"times the full-order step's speed, δ {100 * delta:.3g} %, {memory:.3g} MiB"
-    )
-
-
-def _together(
-    run: ReducedMPM,
-    chain: Pipeline,
-    count: int,
-    full_ms: float,
-    case: Case,
-    truth: Path,
-    figures: Measurements,
-) -> None:
-    """Add the rows of many runs at once, the first of which is one that has been timed alone.
-
-    Args:
-        run, case: that one.
-        chain: whose recurrence is run.
-        count: how many.
-        full_ms: time of a full-order step [ms].
-        truth: trajectory file of the first run.
+        chain: of the scene, with `model=recurrence`; taught.
+        count: how many runs.
         figures: gets the rows.
     """
+    settings, manifold, scene = figures.settings, chain.manifold(), chain.scene
     low, high = chain.split.box.T
     drawn = np.random.default_rng(0).uniform(low, high, (count - 1, len(low)))
-    cases = [chain.held_out[0], *map(chain.scene.case, drawn)]
-    many, peak = build(partial(Many, chain.recurrence(), run, cases), figures.settings.device)
-    (ms,) = run_times({count: many}, figures.settings.trials, figures.settings.device).values()
-    latents = run.trajectory().t, many.xhat[0], run.decoder().position
-    delta = error_of_latents(*latents, truth, run.xhat)
-    case = replace(case, name=f"recurrence_batch{count}", batch=count)
-    _add_run(figures, case, ms / count, full_ms, delta, many.nbytes, peak, chain.taught)
+    cases = [chain.held_out[0], *map(scene.case, drawn)]
+    for precision in settings.precisions:
+        one = chain.solver_at(manifold, cases[0], precision=precision)
+        many, peak = build(partial(Many, chain.recurrence(), one, cases), settings.device)
+        (ms,) = turns({count: WholeRun(many, scene.steps)}, settings.trials, settings.device).values()
+        case = Case(
+            bench="recurrence", name=f"recurrence_batch{count}", particles=scene.particle_count,
+            sample=one.sample_size, batch=count, precision=precision,
+        )  # fmt: skip
+        t = one.dt * np.arange(scene.steps + 1)
+        truth = chain.truth(cases[0]).path / TRAJECTORY
+        delta = error_of_latents(t, many.xhat[0], one.decoder().position, truth, one.xhat)
+        step = figures.add(case, "step", ms / count / scene.steps)
+        figures.add(case, "peak memory", peak, "MiB")
+        figures.add(case, "δ", delta, "1")
+        figures.add(case, "memory of the runs", many.nbytes / 2**20, "MiB")
+        figures.say(f"{case.name} {precision}: {step:.4g} ms a simulation-step, δ {100 * delta:.3g} %")
 
 
 class Many:

@@ -25,12 +25,12 @@ _LEAD = (
     f"`nsf bench` writes this report from {FILE}."
 )
 _WHOLE = (
-    "Whole runs from t = 0, all sides of a scene turn by turn: the run by recurrence has every frame decoded "
-    "in fp32 and the spread of its members computed, the others leave their states on the device. The grid "
-    "of `coarse` is twice as coarse. Error: of the displacements of all particles over five frames, beside "
-    "those of the full-order run in the highest precision measured; error bar: the spread of the members "
-    "over the same displacements. First frame: from the files of a deployed model, nothing compiled anew. "
-    "The model is trained and taught quickly, with fewer runs and steps than by default."
+    "Whole runs from t = 0, all sides of a scene turn by turn: the run by recurrence has its error bounded "
+    "and every frame decoded in fp32, the others leave their states on the device. The grid of `coarse` is "
+    "twice as coarse. Error: of the displacements of all particles over five frames, beside those of the "
+    "full-order run in the highest precision measured; error bar: what `nsf deploy` says of that run, which "
+    "the error exceeds in one run of ten. First frame: from the files of a deployed model, nothing compiled "
+    "anew. The model is trained and taught quickly, with fewer runs and steps than by default."
 )
 _REDUCED = "Time of a step of both solvers by scene; a point names δ of its run, at the first held-out value."
 _STAGES = (
@@ -48,9 +48,8 @@ _TRAINING = (
     "opening its files to the manifold, and the trials are seeds."
 )
 _RECURRENCE = (
-    "Time of a step by the recurrence: all steps of a run in one launch, over their number; of many runs at "
-    "once, over their number too. Speed-up: over the full-order step of the same call. A run holds no "
-    "particles but S."
+    "Time of a step of one of many runs by the recurrence at once: all steps of all runs are one launch, "
+    "over their number. A run holds no particles but S."
 )
 _BATCH = (
     "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "

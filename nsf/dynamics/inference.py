@@ -77,6 +77,7 @@ class Decoder:
     def __init__(self, at: Restriction, stress: StressSource, affine: AffineSource):
         self.at, self._stress, self._affine = at, stress, affine
         self._expand = torch.tensor(TAU_MATRIX, device=at.device).flatten()
+        self._zero = torch.zeros(at.points, 3, 3, dtype=at.dtype, device=at.device)
 
     def position(self, xhat: torch.Tensor) -> torch.Tensor:
         """x = g(X, x̂), [n, 3] of x̂ [r] or [F, n, 3] of x̂ [F, r], in metres."""
@@ -89,12 +90,13 @@ class Decoder:
     def stress(self, xhat: torch.Tensor, stress: torch.Tensor | None = None) -> torch.Tensor:
         """τ [F, n, 3, 3] of x̂ [F, r], in pascals; of ŝ [F, n_s], coordinates of τ, where there are any."""
         if stress is None or not stress.shape[-1]:
+            if getattr(self._stress, "of_batches", False):
+                return self._stress(xhat)
             return torch.stack([self._stress(row).clone() for row in xhat])
         tau = self.at.stress_of(stress.to(self.at.device, self.at.dtype))
         return tau[..., self._expand].unflatten(-1, (3, 3))
 
     def affine(self, xhat: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
         """C [F, n, 3, 3] of x̂ and dx̂/dt [F, r], in 1/s."""
-        frames = [self._affine(*row) for row in zip(xhat, rate, strict=True)]
-        zero = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
-        return torch.stack([zero if C is None else C for C in frames])
+        C = self._affine(xhat, rate)
+        return self._zero.expand(len(xhat), -1, -1, -1) if C is None else C

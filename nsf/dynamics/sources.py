@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 import warp as wp
@@ -99,16 +100,18 @@ class Sources:
 
 
 class StressNeural:
-    """τ = h(X, x̂, μ) (paper section 4.3)."""
+    """τ = h(X, x̂, μ) (paper section 4.3), also of x̂ [F, r]."""
+
+    of_batches: ClassVar[bool] = True
 
     def __init__(self, at, parameters: torch.Tensor):
         self.at, self.parameters = at, parameters
         self._expand = torch.tensor(TAU_MATRIX, device=parameters.device).flatten()
 
     def __call__(self, xhat: torch.Tensor) -> torch.Tensor:
-        """[n, 3, 3] Kirchhoff stress [Pa]."""
+        """[..., n, 3, 3] Kirchhoff stress [Pa]."""
         tau = self.at.stress(xhat, self.parameters)
-        return tau.index_select(-1, self._expand).view(-1, 3, 3)
+        return tau.index_select(-1, self._expand).unflatten(-1, (3, 3))
 
 
 class StressFromDeformation:

@@ -13,7 +13,7 @@ from nsf.bench import bench
 from nsf.bench.batch import _too_large, cases_of
 from nsf.bench.batch import measured as measured_batches
 from nsf.bench.full_order import collapse, pass_times
-from nsf.bench.measure import bandwidth, run_times, window_times
+from nsf.bench.measure import WholeRun, bandwidth, turns, window_times
 from nsf.bench.reduced import measured as measured_chain
 from nsf.bench.reduced import measured_networks
 from nsf.bench.report import (
@@ -152,9 +152,7 @@ def test_the_sand_falls_apart():
 
 
 class Solver:
-    """Writes down what it is asked for."""
-
-    total_steps = 5
+    """Writes down its calls."""
 
     def __init__(self, name, done):
         self.name, self.done, self.steps_taken = name, done, 3
@@ -174,7 +172,7 @@ def test_windows_and_whole_runs_take_turns():
     assert [name for name, n in done if n == 10] == ["a", "b"] * 2
     assert [len(times) for times in found.values()] == [2, 2]
     done.clear()
-    found = run_times(solvers, 2, "cpu")
+    found = turns({name: WholeRun(solver, 5) for name, solver in solvers.items()}, 2, "cpu")
     assert done == 3 * ["restart a", ("a", 5), "restart b", ("b", 5)]
     assert [len(times) for times in found.values()] == [2, 2]
 
