@@ -118,7 +118,8 @@ class FrameRecorder:
         precision: of the state.
         stored: precision of the recorded values.
         memory: host memory of the blocks.
-        capacity: most frames of a block; as many as 64 MiB hold if that is less.
+        capacity: most frames of a block.
+        room: [byte] of a block, at most; it holds one frame at least.
     """
 
     def __init__(
@@ -128,11 +129,12 @@ class FrameRecorder:
         stored: Precision = FP32,
         memory: HostMemory | None = None,
         capacity: int | None = None,
+        room: int = _BLOCK_BYTES,
     ):
         self._memory = memory or HostMemory()
         self._state = state
         self._device = state.order.device
-        fitting = max(1, _BLOCK_BYTES // frame_bytes(len(state), stored))
+        fitting = max(1, room // frame_bytes(len(state), stored))
         self.capacity = min(capacity or fitting, fitting)
         # A field lies in one piece, as on disk, so that its frames are written without another copy.
         self._block = {

@@ -18,6 +18,7 @@ from nsf.mpm.recording import FrameRecorder
 from nsf.storage import writing
 
 _FRAMES = 64  # that are encoded together, at most
+_ROOM = {True: 2**30, False: 2**26}  # [byte] of these frames on a GPU, and on a CPU
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,8 @@ def streamed(solver, steps: int, encoder: Encoder, after: Callable[[], object] =
 
 def _frames(solver, steps: int, after: Callable[[], object]) -> Iterator[tuple[Tensor, Tensor]]:
     """Positions [F, P, 3] and τ [F, P, 6] of the present state and after each step, some frames at once."""
-    recorder = FrameRecorder(solver.state, solver.precision, FP32, capacity=_FRAMES)
+    room = _ROOM[solver.device.is_cuda]
+    recorder = FrameRecorder(solver.state, solver.precision, FP32, capacity=_FRAMES, room=room)
     for n in range(steps + 1):
         if n:
             solver.step()
