@@ -153,7 +153,8 @@ def _deviation(values: Tensor) -> Tensor:
     """Deviation [k] of [N, R, k]; of what hardly varies a billionth of the largest."""
     if not values.shape[-1]:
         return values.new_ones(0)
-    deviation = values.flatten(0, -2).std(0)
+    rows = values.flatten(0, -2)
+    deviation = rows.std(0, correction=min(1, len(rows) - 1))
     return deviation.clamp_min(1e-9 * float(deviation.max().clamp_min(1e-30)))
 
 
@@ -259,13 +260,12 @@ class Descent:
 
         self._form = Form(form.sizes, form.dt, form.stride).to(device)
         self._form.load_state_dict(form.state_dict())
-        self._runs = [here(v) for v in (runs.xhat, runs.changes, runs.stress, runs.parameters, runs.gravity)]
-        self._c = here(form.collider_state(runs.features))
+        self._states = here(form.standard(State(runs.xhat, runs.changes, runs.stress)))
+        inputs = form.standard_inputs(runs.parameters, runs.gravity, form.collider_state(runs.features))
+        self._seen, self._terms = map(here, inputs)
         self._fitting, self._generator = fitting, torch.Generator().manual_seed(seed)
         self._device, self._taken = torch.device(device), 0
-        sigma = here(sigma)
-        self._weight = sigma.square() / (sigma * self._form.x_scale).square().sum()
-        self._weight = self._weight + _EACH / (self._form.x_scale.square() * len(sigma))
+        self._weight, self._single = (here(weights) for weights in _weights(form, sigma))
         captured = self._device.type == "cuda"
         rate = torch.tensor(_RATE, device=device) if captured else _RATE
         self._adam = torch.optim.Adam(self._form.parameters(), lr=rate, betas=_BETAS, capturable=captured)
@@ -294,13 +294,13 @@ class Descent:
 
     def _drawn(self, window: int) -> list[Tensor]:
         """Runs and first strides [M, b] of windows, and noise on x̂ and ŝ [M, b, ·], for each member."""
-        x, _, s, *_ = self._runs
-        shape, generator = (self._form.sizes.members, self._fitting.batch), self._generator
+        sizes, generator = self._form.sizes, self._generator
+        (strides, runs, _), shape = self._states.shape, (sizes.members, self._fitting.batch)
         drawn = [
-            torch.randint(x.shape[1], shape, generator=generator),
-            torch.randint(len(x) - window, shape, generator=generator),
-            torch.randn(*shape, x.shape[2], generator=generator),
-            torch.randn(*shape, s.shape[2], generator=generator),
+            torch.randint(runs, shape, generator=generator),
+            torch.randint(strides - window, shape, generator=generator),
+            torch.randn(*shape, sizes.latents, generator=generator),
+            torch.randn(*shape, sizes.stress, generator=generator),
         ]
         return [values.to(self._device) for values in drawn]
 
@@ -319,35 +319,21 @@ class Descent:
 
     def _loss(self, window: int, k: Tensor, n: Tensor, of_x: Tensor, of_s: Tensor) -> Tensor:
         """Sum over members of the mean loss of their windows."""
-        form, noise = self._form, self._fitting.noise
-        x, d, s, mu, g = self._runs
+        form, ratios = self._form, self._form.ratios
         steps = n + torch.arange(window + 1, device=n.device)[:, None, None]
-        x, d, s = x[steps, k], d[steps, k], s[steps, k]
-        mu, g, c = mu[k], g[steps[:-1], k], self._c[steps[:-1], k]
-        begun = State(x[0], d[0], s[0])
-        state = State(x[0] + noise * form.x_scale * of_x, d[0], s[0] + noise * form.s_scale * of_s)
-        errors = []
-        for j in range(window):
-            state, error = self._take(state, State(x[j + 1], d[j + 1], s[j + 1]), mu, g[j], c[j])
-            errors.append(error)
+        truth, seen, terms = self._states[steps, k], self._seen[steps[:-1], k], self._terms[steps[:-1], k]
+        noise = torch.cat([of_x, torch.zeros_like(of_x), of_s], -1)
+        state, offs = truth[0] + self._fitting.noise * noise, []
+        for target, *inputs in zip(truth[1:], seen, terms, strict=True):
+            off = _held(form.advance(state, *inputs, ratios) - target)
+            state = target + off
+            offs.append(off)
+        errors = (self._weight * torch.stack(offs).square()).sum(-1)
         growth = _GROWTH / torch.arange(1.0, window + 1, device=n.device)
-        loss = torch.log1p(growth[:, None, None] * torch.stack(errors)).mean((0, 2))
-        after = form.step(begun, mu, g[0], c[0])
-        single = ((after.change - d[1]) / form.a_scale).square().mean((1, 2))
-        if form.sizes.stress:
-            single = single + ((after.stress - s[1]) / form.t_scale).square().mean((1, 2))
+        loss = torch.log1p(growth[:, None, None] * errors).mean((0, 2))
+        apart = form.advance(truth[0], seen[0], terms[0], ratios) - truth[1]
+        single = (self._single * apart.square()).sum(-1).mean(1)
         return (loss + _SINGLE * single).sum()
-
-    def _take(self, state: State, target: State, mu: Tensor, g: Tensor, c: Tensor) -> tuple[State, Tensor]:
-        """The state after a stride, held near the target, and its error [M, b]."""
-        form = self._form
-        state = form.step(state, mu, g, c)
-        scales = form.x_scale, form.d_scale, form.s_scale
-        off = [_held(a - b, scale) for a, b, scale in zip(state, target, scales, strict=True)]
-        error = (self._weight * off[0].square()).sum(-1)
-        if form.sizes.stress:
-            error = error + _STRESS * (off[2] / form.s_scale).square().mean(-1)
-        return State(*(b + by for b, by in zip(target, off, strict=True))), error
 
     def _captured(self, window: int) -> Callable[..., None]:
         """A step of the descent as a CUDA graph."""
@@ -384,9 +370,25 @@ class Descent:
                 value.copy_(moments[i][name]) if i in moments else value.zero_()
 
 
-def _held(values: Tensor, scale: Tensor) -> Tensor:
-    """Values held within ± `_FAR` deviations, small ones nearly as they are."""
-    return _FAR * scale * torch.tanh(values / (_FAR * scale))
+def _held(off: Tensor) -> Tensor:
+    """Values in deviations held within ± `_FAR`, small ones nearly as they are."""
+    return _FAR * torch.tanh(off / _FAR)
+
+
+def _weights(form: Form, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """[2 r + n_s] of squared errors of a standardised state [x̂; d; ŝ], in a window and in single strides.
+
+    Args:
+        form: with the scales.
+        sigma: [r] how far particles move with each coordinate.
+    """
+    moves = (sigma.to(form.x_scale) * form.x_scale).square()
+    place = moves / moves.sum() + _EACH / len(moves)
+    stress = form.s_scale.new_full((form.sizes.stress,), 1.0 / max(1, form.sizes.stress))
+    single = (form.d_scale / form.a_scale).square() / len(moves)
+    in_window = [place, torch.zeros_like(place), _STRESS * stress]
+    in_single = [torch.zeros_like(place), single, stress * (form.s_scale / form.t_scale).square()]
+    return torch.cat(in_window), torch.cat(in_single)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ there is no A, H and k. docs/method.md derives it. Not in the paper, which leave
 work (section 7, "Path-dependent plasticity").
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -142,36 +143,69 @@ class Form(nn.Module):
             parameters: μ [..., n]; gravity: [..., 3] [m/s²] and c: [..., C], means over the stride; each may
                 lack leading axes.
         """
+        inputs = self.standard_inputs(parameters, gravity, c)
+        return self.in_units(self.advance(self.standard(state), *inputs, self.ratios))
+
+    def advance(self, z: Tensor, seen: Tensor, terms: Tensor, ratios: Sequence[Tensor]) -> Tensor:
+        """The standardised state z = [x̂; d; ŝ] after a stride; of `standard`, `standard_inputs`, `ratios`."""
+        x, d, s = self._parts(z)
+        seen, terms = (values.expand(*x.shape[:-1], -1) for values in (seen, terms))
+        of_change, of_place, of_stress = ratios
+        d = torch.addcmul(d, of_change, self._applied("motion", [x, seen], [d, terms, s]))
+        return torch.cat([torch.addcmul(x, of_place, d), d, self._stressed(x, d, s, seen, of_stress)], -1)
+
+    def standard(self, state: State) -> Tensor:
+        """The state with zero mean and in units of its deviation, z [..., 2 r + n_s]."""
         x, d, s = state
-        sigma = (s - self.s_mean) / self.s_scale
-        g = ((gravity - self.g_mean) / self.g_scale).expand(*x.shape[:-1], -1)
-        terms = [d / self.d_scale, torch.ones_like(x[..., :1]), *([g] if self.sizes.gravity else []), sigma]
-        d = d + self.a_scale * self._applied("motion", self._seen(x, parameters, c), terms)
-        return State(x + d, d, self.next_stress(x, d, s, parameters, c))
+        parts = (x - self.x_mean) / self.x_scale, d / self.d_scale, (s - self.s_mean) / self.s_scale
+        return torch.cat(parts, -1)
+
+    def in_units(self, z: Tensor) -> State:
+        """The state of a standardised one."""
+        x, d, s = self._parts(z)
+        return State(self.x_mean + self.x_scale * x, self.d_scale * d, self.s_mean + self.s_scale * s)
+
+    def standard_inputs(self, parameters: Tensor, gravity: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """Standardised [μ; c] [..., n + C] and [1; g] [..., 4], or [1] without gravity."""
+        g = (gravity - self.g_mean) / self.g_scale
+        one = torch.ones_like(g[..., :1])
+        return self._seen(parameters, c), torch.cat([one, g], -1) if self.sizes.gravity else one
+
+    @property
+    def ratios(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Units of d' − d over those of d, of d over x̂ and of ŝₙ₊₁ − ŝₙ over ŝ; [r], [r] and [n_s]."""
+        return self.a_scale / self.d_scale, self.d_scale / self.x_scale, self.t_scale / self.s_scale
 
     def next_stress(
         self, xhat: Tensor, change: Tensor, stress: Tensor, parameters: Tensor, c: Tensor
     ) -> Tensor:
         """ŝₙ₊₁ of x̂ₙ, d' and ŝₙ; other arguments as for `step`."""
-        if not self.sizes.stress:
-            return stress
-        moved, sigma = change / self.d_scale, (stress - self.s_mean) / self.s_scale
-        seen, terms = (
-            [*self._seen(xhat, parameters, c), sigma, moved],
-            [moved, torch.ones_like(moved[..., :1])],
-        )
-        return stress + self.t_scale * self._applied("stress", seen, terms)
+        x, d, s = self._parts(self.standard(State(xhat, change, stress)))
+        seen = self._seen(parameters, c).expand(*x.shape[:-1], -1)
+        return self.s_mean + self.s_scale * self._stressed(x, d, s, seen, self.ratios[2])
 
-    def _seen(self, xhat: Tensor, parameters: Tensor, c: Tensor) -> list[Tensor]:
-        """Inputs that both networks have."""
-        lead, mu = xhat.shape[:-1], (parameters - self.mu_mean) / self.mu_scale
-        return [(xhat - self.x_mean) / self.x_scale, mu.expand(*lead, -1), c.expand(*lead, -1)]
+    def _stressed(self, x: Tensor, d: Tensor, s: Tensor, seen: Tensor, ratio: Tensor) -> Tensor:
+        """Standardised ŝₙ₊₁."""
+        if not self.sizes.stress:
+            return s
+        terms = [d, torch.ones_like(d[..., :1])]
+        return torch.addcmul(s, ratio, self._applied("stress", [x, seen, s, d], terms))
+
+    def _parts(self, z: Tensor) -> Sequence[Tensor]:
+        """x̂, d and ŝ of a standardised state."""
+        return z.split([self.sizes.latents, self.sizes.latents, self.sizes.stress], -1)
+
+    def _seen(self, parameters: Tensor, c: Tensor) -> Tensor:
+        """Standardised [μ; c] [..., n + C]."""
+        mu = (parameters - self.mu_mean) / self.mu_scale
+        lead = torch.broadcast_shapes(mu.shape[:-1], c.shape[:-1])
+        return torch.cat([mu.expand(*lead, -1), c.expand(*lead, -1)], -1)
 
     def _applied(self, name: str, seen: list[Tensor], terms: list[Tensor]) -> Tensor:
         """The matrix of a network [M, ..., rows, columns] times the terms [M, ..., columns]."""
         terms = torch.cat(terms, -1)
         matrix = self.networks[name](torch.cat(seen, -1)).unflatten(-1, (-1, terms.shape[-1]))
-        return (matrix @ terms[..., None])[..., 0]
+        return (matrix @ terms.unsqueeze(-1)).squeeze(-1)
 
     def run(self, start: State, parameters: Tensor, gravity: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """x̂ [N + 1, M, B, r] and ŝ [N + 1, M, B, n_s] of N strides.
@@ -180,10 +214,11 @@ class Form(nn.Module):
             start: of M members and B runs.
             parameters: μ [B, n]; gravity: [N, B, 3]; c: [N, B, C]; B may be 1.
         """
-        states = [start]
-        for g, now in zip(gravity, c, strict=True):
-            states.append(self.step(states[-1], parameters, g, now))
-        return torch.stack([state.xhat for state in states]), torch.stack([state.stress for state in states])
+        inputs, states = self.standard_inputs(parameters, gravity, c), [self.standard(start)]
+        for seen, terms in zip(*inputs, strict=True):
+            states.append(self.advance(states[-1], seen, terms, self.ratios))
+        run = self.in_units(torch.stack(states))
+        return run.xhat, run.stress
 
     def begin(self, xhat: Tensor, change: Tensor, stress: Tensor | None = None) -> State:
         """The state of all members at t = 0: x̂ and d [B, r], and ŝ [B, n_s], 0 by default."""

@@ -9,8 +9,9 @@ import torch
 
 from nsf.errors import ConfigError, InstabilityError
 from nsf.recurrence import Fitting, Runs, Yardstick, fit, standardised
-from nsf.recurrence.descent import windows
+from nsf.recurrence.descent import Descent, windows
 from nsf.recurrence.fitting import check_stride
+from nsf.recurrence.form import State
 
 SHORT = Fitting(width=16, descents=12, batch=32)
 
@@ -147,3 +148,30 @@ def test_a_stride_divides_the_steps():
     check_stride(5, 250)
     with pytest.raises(ConfigError, match=r"model\.stride=3 does not divide the 250 steps .* one of 1, 2, 5"):
         check_stride(3, 250)
+
+
+def test_the_loss_of_a_window_is_that_of_the_form_in_units():
+    """A window of three strides, written with `Form.step`."""
+    runs, fitting, window = damped(), replace(SHORT, members=2, noise=0.0, batch=5), 3
+    form = standardised(runs, fitting, 0.01, 1, True, 0)
+    for weights in form.parameters():
+        weights.data += 0.1 * torch.randn(weights.shape, generator=torch.Generator().manual_seed(1)).double()
+    descent = Descent(form, runs, torch.tensor([1.0, 2.0]), fitting, 0, "cpu")
+    k, n, *noise = descent._drawn(window)
+    c, moves = form.collider_state(runs.features), (torch.tensor([1.0, 2.0]) * form.x_scale).square()
+    at = [State(*(v[n + j, k] for v in (runs.xhat, runs.changes, runs.stress))) for j in range(window + 1)]
+    state, scales, expected = at[0], (form.x_scale, form.d_scale, form.s_scale), torch.zeros(2).double()
+    for j in range(window):
+        after = form.step(state, runs.parameters[k], runs.gravity[n + j, k], c[n + j, k])
+        if j == 0:
+            single = ((after.change - at[1].change) / form.a_scale).square().mean((1, 2))
+            single += ((after.stress - at[1].stress) / form.t_scale).square().mean((1, 2))
+        pairs = zip(after, at[j + 1], scales, strict=True)
+        x, d, s = (8 * torch.tanh((a - b) / scale / 8) for a, b, scale in pairs)
+        state = State(*(b + off * scale for b, off, scale in zip(at[j + 1], (x, d, s), scales, strict=True)))
+        error = (moves / moves.sum() * x.square()).sum(-1)
+        error = error + 0.02 * x.square().mean(-1) + 0.1 * s.square().mean(-1)
+        expected += torch.log1p(1000 * error / (1 + j)).mean(1) / window
+    torch.testing.assert_close(
+        descent._loss(window, k, n, *noise).double(), (expected + 0.3 * single).sum(), rtol=1e-4, atol=0.0
+    )
