@@ -46,10 +46,9 @@ def _checked(text: str, cwd: str) -> tuple[Path, ...]:
                 raise ConfigError(f"{folder / name} is refused, as it would replace nsf's; take it out")
         names = [path.relative_to(folder).as_posix() for path in _files(folder)]
         if not names:
-            raise ConfigError(
-                f"{folder} has no groups of configurations; name the folder that holds them, as "
-                f"{folder.name}/scene/NAME.yaml, of {', '.join(_own_groups())}"
-            )
+            inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and any(_files(path))]
+            remedy = f"did you mean {inner[0]}?" if inner else f"its groups may be {', '.join(_own_groups())}"
+            raise ConfigError(f"{folder} has no groups of configurations, as scene/NAME.yaml; {remedy}")
         if twice := [name for name in names if name in owners]:
             raise ConfigError(f"{folder} and {owners[twice[0]]} both have {twice[0]}; rename one")
         owners |= dict.fromkeys(names, folder)

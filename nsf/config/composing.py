@@ -357,7 +357,8 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
     if option and group:
         name, names = option[1].removeprefix(f"{group}/"), groups()[group]
         near = difflib.get_close_matches(name, names, n=1)
-        return f"unknown {group}={name}; choose one of {', '.join(names)}" + (
-            f" (did you mean {near[0]}?)" if near else ""
-        )
+        if Path("conf", group, f"{name}.yaml").is_file():
+            return f"unknown {group}={name}; conf has it: add --config-dir conf"
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        return f"unknown {group}={name}; choose one of {', '.join(names)}{hint}"
     return first

@@ -95,6 +95,8 @@ def resolved(config: DictConfig) -> Any:
         detail = re.sub(r"^\w*Error raised while resolving interpolation: ", "", str(error).splitlines()[0])
         if detail.startswith("Recursive interpolation"):
             detail = "it refers to itself, by way of other keys or not; give one of them a value"
+        if detail.startswith("Missing mandatory value"):
+            detail = "it has no value; set one"
         if missing := _MISSING.match(detail):
             detail = f"it refers to {missing[1]}, which is missing; give that a value"
         raise ConfigError(f"{error.full_key}: {detail}" if error.full_key else detail) from error

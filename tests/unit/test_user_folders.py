@@ -114,3 +114,10 @@ def test_jobs_in_other_processes_have_it_too(folder):
         "latent_dim=2",
     ]
     subprocess.run([*command, "--config-dir", str(folder), "seed=0,1"], env=environment, check=True)
+
+
+def test_a_folder_that_is_not_named_is_hinted_at(folder, monkeypatch, capsys):
+    folder.rename(folder.with_name("conf"))
+    monkeypatch.chdir(folder.parent)
+    assert "conf has it: add --config-dir conf" in told(capsys, "run", "scene=dune")
+    assert "/conf?" in told(capsys, "run", "--config-dir", ".", "scene=dune")
