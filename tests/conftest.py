@@ -13,6 +13,7 @@ import pytest
 # Before torch: on matrices this small, threads cost more than they give, and tests run beside each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import browsers
 import torch
 from tiny import TINY, tiny_pipeline
 
@@ -204,16 +205,16 @@ def chromium():
     return path
 
 
+@pytest.fixture(scope="module")
+def launched(chromium):
+    """A browser of the tests of a module: it takes a second to start, and another to end."""
+    with browsers.launched(chromium) as browser:
+        yield browser
+
+
 @pytest.fixture
-def browser(chromium):
-    """A headless Chromium with software WebGL.
-
-    Of one test: while it is open its thread has a running event loop, which tests with `asyncio.run` refuse.
-    """
-    from playwright.sync_api import sync_playwright
-
-    software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_playwright() as started:
-        opened = started.chromium.launch(executable_path=chromium, args=["--no-sandbox", *software])
-        yield opened
-        opened.close()
+def browser(launched):
+    """A browser without tabs, and none is left after a test."""
+    yield launched
+    for context in launched.contexts:
+        context.close()

@@ -13,6 +13,7 @@ import urllib.request
 from contextlib import asynccontextmanager
 from types import SimpleNamespace
 
+import browsers
 import numpy as np
 import pytest
 from angles import angle
@@ -485,6 +486,13 @@ def threaded(model, **options):
 @pytest.fixture
 def address(model):
     yield from threaded(model)
+
+
+@pytest.fixture
+def launched(chromium):
+    """A browser of one test, since others of this module call `asyncio.run`."""
+    with browsers.launched(chromium) as browser:
+        yield browser
 
 
 def test_a_browser_decodes_what_the_server_does(browser, address, model):
