@@ -100,8 +100,9 @@ def _culprit(config_name: str, overrides: Sequence[str]) -> str:
     """The override of a key without which the rest can be composed, as a part of a message."""
     for override in (o for o in overrides if "." in o.partition("=")[0]):
         rest = [o for o in overrides if o != override]
-        if _with_values(config_name, rest, check_sizes(files())):
-            return f" with {override}"
+        with suppress(HydraException, OmegaConfBaseException, ConfigError, *_OF_BROKEN_FILES):
+            if _with_values(config_name, rest, check_sizes(files())):
+                return f" with {override}"
     return ""
 
 
@@ -173,10 +174,10 @@ def _with_values(config_name: str, overrides: Sequence[str], sizes: _Sizes) -> D
     """
     names = groups()
     options = tuple(o for o in overrides if _of_group(o, names))
+    config = pickle.loads(_of_groups(config_name, options, sizes))
     with suppress(HydraException, OmegaConfBaseException, *_OF_BROKEN_FILES):
         values = OverridesParser.create().parse_overrides([o for o in overrides if o not in options])
         if not any(value.is_sweep_override() for value in values):
-            config = pickle.loads(_of_groups(config_name, options, sizes))
             ConfigLoaderImpl._apply_overrides_to_config(values, config)
             return config
     return None
