@@ -10,6 +10,7 @@ from nsf.data import Trajectory
 from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError
 from nsf.export.playback import Playback
+from nsf.results.charts import CHARTS
 
 TWO = (
     "+scene.parameters.friction_angle.range=[22,38]",
@@ -72,6 +73,8 @@ def test_results_name_the_cases(made):
 
 def test_a_report_names_the_cases(made, monkeypatch):
     monkeypatch.setattr("nsf.results.pictures._MANY", 0)  # a picture of a variant
+    charts = {name: CHARTS[name] for name in ("delta", "error_over_parameters")}
+    monkeypatch.setattr("nsf.results.report.CHARTS", charts)
     pipeline, _ = made
     page = pipeline.report()
     text = page.read_text()

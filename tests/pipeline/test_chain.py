@@ -535,7 +535,7 @@ def test_super_resolution_of_a_deployment(copied, pipeline_at):
     assert table.notna().all(axis=None)
     assert table["seconds"][0] > 0
     assert 0 < table["delta"][0] < 0.05
-    assert (run.path / "superresolution.png").stat().st_size > 10_000
+    assert (run.path / "superresolution.png").stat().st_size > 4_000
     _, again = said_by(pipeline_at, root, *options, stages=["superresolve"])
     assert again == [f"superresolve: inputs unchanged, reused → {run.id}"]
 
