@@ -33,9 +33,10 @@ def pytest_runtest_setup(item):
 
 
 def pytest_collection_finish(session):
-    """Collections of garbage pass over what stays to the end: libraries and tests, a million objects."""
+    """Collections of garbage pass over what stays to the end, a million objects, and are rarer."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -17,7 +17,7 @@ TINY = (
     "trainer.steps=200",
     "latent_dim=4",
     "sampler.size=20",
-    "evaluation.trials=2",
+    "evaluation.trials=1",
     "evaluation.picture_particles=100",
     "evaluation.picture_frames=3",
 )

@@ -130,7 +130,7 @@ def test_files_of_an_evaluation(chain):
     assert set(np.unique(frames["role"])) == {0, 1, 2}  # S moves as particles about it do, not as all do
     cost = json.loads((path / "cost.json").read_text())
     assert set(cost["breakdown"]["reduced"]) == {"inference", "p2g", "g2p", "inversion"}
-    assert cost["trials"] == 2
+    assert cost["trials"] == 1
     summary = json.loads((path / "summary.json").read_text())
     assert summary["reconstruction_delta"] < summary["delta"]
 

@@ -79,7 +79,7 @@ def test_a_bound_is_the_deployments(model, deployed):
     assert model.error_bound(ONE, Forcing(-own.gravity, own.solids)) == np.inf
     rollout = Rollout.open(deployed.deployment.file(rollout_file(0)))
     bound = model.error_bound([rollout.case[name] for name in model.names])
-    assert float(bound) == pytest.approx(rollout.verdict.bound_share, rel=0.05)
+    assert float(bound) == pytest.approx(rollout.verdict.bound_share, rel=0.1)
 
 
 def test_bad_input(model, chain):

@@ -192,7 +192,7 @@ def test_odd_tensors(path, change, message):
         Manifold.load(path)
 
 
-@pytest.mark.parametrize("huge", [10**6, 10**9, 10**12, 2**63, 10**30, -(10**12)])
+@pytest.mark.parametrize("huge", [10**6, 2**63, -(10**12)])
 @pytest.mark.parametrize("key", ["particles", "frames", "depth", "members"])
 def test_sizes_that_no_file_could_fill(path, key, huge):
     content = torch.load(path, weights_only=True)
