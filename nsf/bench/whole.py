@@ -240,7 +240,7 @@ def _add_ratios(figures: Measurements, recurrence: Case, times: Mapping[Case, Se
     """Add how many times as long the others take as the run by recurrence, all of its frames decoded."""
     own = float(np.median(times[recurrence]))
     for case, ms in times.items():
-        if case is not recurrence:
+        if case != recurrence:
             own_name = recurrence.name.removeprefix("recurrence")
             what = f"{case.name.replace(own_name, '').replace('_', ' ')} {case.precision}"
             ratio = figures.add(recurrence, f"time of {what} over it", float(np.median(ms)) / own, "1")

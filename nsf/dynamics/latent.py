@@ -112,10 +112,19 @@ class LatentRecord:
         self.row += 1
         self.xhat.index_copy_(0, self.row, result.xhat[None])
 
-    def trajectory(self, steps: int, dt: float, tolerance: float) -> LatentTrajectory:
-        """The first steps of dt [s] on the host; `tolerance` is the projector's."""
+    def trajectory(
+        self, steps: int, dt: float, tolerance: float, stops: list[str] | None = None
+    ) -> LatentTrajectory:
+        """The first steps of dt [s] on the host.
+
+        Args:
+            steps: how many.
+            dt: length of each.
+            tolerance: of the projector.
+            stops: reasons, of steps that were not projected; None: found from residuals and updates.
+        """
         residuals, updates = self.residuals[:steps].cpu(), self.updates[:steps].cpu()
-        stops = stop_reasons(residuals, updates, tolerance)
+        stops = stop_reasons(residuals, updates, tolerance) if stops is None else stops
         t, xhat = np.arange(steps + 1) * dt, self.xhat[: steps + 1].cpu().numpy()
         stress = None if self.stress is None else self.stress[: steps + 1].cpu().numpy()
         return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops, stress)

@@ -1,7 +1,6 @@
 """The reduced-order solver, of one run or of several that take their steps together (paper section 5)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -294,10 +293,9 @@ class ReducedMPM:
 
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""
-        trajectory = self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance)
-        if self.span.latent_only:  # nothing was projected, so nothing stopped
-            trajectory = replace(trajectory, stops=[self.engine] * self.steps_taken)
-        return trajectory
+        # Of latent vectors alone nothing was projected, so nothing stopped.
+        stops = [self.engine] * self.steps_taken if self.span.latent_only else None
+        return self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance, stops)
 
     @property
     def sample_size(self) -> int:
