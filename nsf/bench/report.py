@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from nsf.bench.rows import FILE, WIDE, read, size_name
-from nsf.results.charts import bars
+from nsf.results.charts.costs import bars
 from nsf.results.columns import axis, number
 from nsf.results.formats import Rows, markdown_document, terminal_table
 from nsf.results.style import INK, PALETTE, band, figure, legend, line_style, plain_ticks, save, styled

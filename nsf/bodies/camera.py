@@ -73,10 +73,10 @@ class View:
         low, high = flat.min(axis=0), flat.max(axis=0)
         reach = _BEYOND * max(high - low)
         if solids is not None and len(solids):
-            there = camera.project(solids)[:, :2]
+            seen = camera.project(solids)[:, :2]
             low, high = (
-                np.maximum(np.minimum(low, there.min(axis=0)), low - reach),
-                np.minimum(np.maximum(high, there.max(axis=0)), high + reach),
+                np.maximum(np.minimum(low, seen.min(axis=0)), low - reach),
+                np.minimum(np.maximum(high, seen.max(axis=0)), high + reach),
             )
         margin = 0.04 * max(high - low)
         # More below, where the length scale stands.

@@ -12,7 +12,6 @@ from nsf.config.composing import load, resolve
 from nsf.config.keys import naming_the_missing, replaced, section
 from nsf.config.resolvers import following
 from nsf.config.targets import build, build_all, filled
-from nsf.data import PROGRAM
 from nsf.errors import ConfigError
 from nsf.scalars import text
 from nsf.scenes import Design, Parameter, Programs, Scene
@@ -99,25 +98,6 @@ def config_of(scene: Scene, overrides: Sequence[str] = ()) -> DictConfig:
     for key, value in plain.items():
         config[key] = value
     return config
-
-
-def recorded_scene(settings: Mapping[str, Any]) -> Scene:
-    """The scene of a simulate or deploy run, in one of its cases.
-
-    Args:
-        settings: the run's configuration.
-
-    Raises:
-        ConfigError: a value is refused, as a mesh that is no longer there.
-    """
-    parameters = {
-        name: {"key": parameter["key"], "unit": ""}
-        for name, parameter in settings["parameters"].items()
-        if name != PROGRAM
-    }
-    content = {key: settings[key] for key in ("material", "transfer")}
-    content["scene"] = settings["scene"] | {"name": "recorded", "parameters": parameters}
-    return _built(resolve(OmegaConf.create(content)), None)
 
 
 def changed_scene(config: DictConfig, scene: Scene, changes: Mapping[str, Any]) -> Scene:

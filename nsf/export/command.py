@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     for name, tells in FORMATS.items():
         parser.add_argument(f"--{name}", action="store_true", help=tells)
-    options = (
+    arguments = (
         ("parameter", str, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
         ("points", int, None, "how many; more than the particles are points in between (super-resolution)"),
         ("color", str, None, "von_mises, the default, or displacement"),
@@ -57,9 +57,9 @@ def _parser() -> argparse.ArgumentParser:
         ("device", str, "auto", "where the fields are decoded: cpu, cuda, cuda:N or auto"),
         ("output", Path, None, "folder; export/<scene>-<hash> in ./reports (NSF_REPORTS) by default"),
     )
-    for name, kind, default, tells in options:
-        told = tells if default is None else f"{tells} ({default})"
-        parser.add_argument(f"--{name}", type=kind, default=default, help=told)
+    for name, kind, default, tells in arguments:
+        text = tells if default is None else f"{tells} ({default})"
+        parser.add_argument(f"--{name}", type=kind, default=default, help=text)
     return parser
 
 
@@ -72,41 +72,41 @@ def main(arguments: Sequence[str]) -> int:
     Raises:
         NSFError: an argument is refused, a run or an extra is missing, or a file cannot be written.
     """
-    asked = _parser().parse_args(arguments)
-    formats = [name for name in FORMATS if getattr(asked, name)]
-    _check(asked, formats)
+    options = _parser().parse_args(arguments)
+    formats = [name for name in FORMATS if getattr(options, name)]
+    _check(options, formats)
     import importlib
 
     from nsf.extras import optional
     from nsf.runs import Run
 
-    if asked.run is None:
+    if options.run is None:
         run = Run.newest("deploy")
         print(f"export: the newest deploy run, {run.id}")
     else:
-        run = Run.named(asked.run, "deploy").require()
+        run = Run.named(options.run, "deploy").require()
     writers = {name: importlib.import_module(f"nsf.export.{name}") for name in formats if name != LIVE}
     for needed in (module for writer in writers.values() for module in writer.NEEDS):
         optional(needed, "export")  # before any work
-    folder = asked.output or reports_folder() / "export" / f"{run.scene}-{run.hash}"
+    folder = options.output or reports_folder() / "export" / f"{run.scene}-{run.hash}"
     if writers:
-        playback = _playback(run, asked)
+        playback = _playback(run, options)
     for name, writer in writers.items():
         _say(name, writer.write(playback, folder))
     if LIVE in formats:
         from nsf.live.publish import write
 
-        _say(LIVE, write(run, folder, asked.points, asked.device))
+        _say(LIVE, write(run, folder, options.points, options.device))
     return 0
 
 
-def _check(asked: argparse.Namespace, formats: Sequence[str]) -> None:
+def _check(options: argparse.Namespace, formats: Sequence[str]) -> None:
     """Refuse no format, no points, and options that no format takes."""
     if not formats:
         raise ConfigError(f"no format; give one or more of {', '.join(f'--{name}' for name in FORMATS)}")
-    if asked.points is not None and asked.points < 1:
-        raise ConfigError(f"points={asked.points} must be a whole number of at least 1")
-    unused = [f"--{name}" for name in _OF_PLAYBACKS if getattr(asked, name) is not None]
+    if options.points is not None and options.points < 1:
+        raise ConfigError(f"points={options.points} must be a whole number of at least 1")
+    unused = [f"--{name}" for name in _OF_PLAYBACKS if getattr(options, name) is not None]
     if formats == [LIVE] and unused:
         raise ConfigError(
             f"--{LIVE} holds every held-out case, which the page shows as its reader asks; "
@@ -114,11 +114,11 @@ def _check(asked: argparse.Namespace, formats: Sequence[str]) -> None:
         )
 
 
-def _playback(run: "Run", asked: argparse.Namespace) -> "Playback":
+def _playback(run: "Run", options: argparse.Namespace) -> "Playback":
     from nsf.export.playback import Playback
 
-    given = {name: value for name in _OF_PLAYBACKS if (value := getattr(asked, name)) is not None}
-    playback = Playback(run, points=asked.points, device=asked.device, **given)
+    chosen = {name: value for name in _OF_PLAYBACKS if (value := getattr(options, name)) is not None}
+    playback = Playback(run, points=options.points, device=options.device, **chosen)
     print(f"export: {playback.title}, {len(playback.t)} frames, {len(playback.X):,} points")
     if playback.stopped is not None:
         print(f"export: warning: the run diverged at t = {playback.stopped:.4g} s; it is shown up to there")
@@ -131,5 +131,5 @@ def _say(name: str, path: Path) -> None:
 
 def _size(path: Path) -> int:
     """Bytes of a file, or of all in a folder."""
-    found = [path] if path.is_file() else path.rglob("*")
-    return sum(file.stat().st_size for file in found if file.is_file())
+    files = [path] if path.is_file() else path.rglob("*")
+    return sum(file.stat().st_size for file in files if file.is_file())

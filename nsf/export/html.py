@@ -35,7 +35,7 @@ def write(playback: Playback, folder: Path) -> Path:
     for block in playback.blocks("html"):
         x[0, block.rows], x[1:, block.rows] = block.X.numpy(), block.x.numpy()
         stress[:, block.rows] = block.von_mises.numpy() / playback.tops["von_mises"]
-    told, arrays = page.recording(x, stress, playback.t)
+    recorded, arrays = page.recording(x, stress, playback.t)
     header = {
         "title": playback.title,
         "run": playback.run.id,
@@ -52,7 +52,7 @@ def write(playback: Playback, folder: Path) -> Path:
         },
         "colors": page.colors(),
         "solids": playback.solids,
-        "recordings": {"run": told},
+        "recordings": {"run": recorded},
     }
-    data = page.packed(header, {f"run.{name}": own for name, own in arrays.items()})
+    data = page.packed(header, {f"run.{name}": array for name, array in arrays.items()})
     return page.saved(folder / f"{playback.name}.html", page.html(playback.title, data))

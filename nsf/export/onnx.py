@@ -124,7 +124,7 @@ def _graph(module: nn.Module, output: str, inputs: dict[str, np.ndarray]):
 def _properties(playback: Playback, phase: str) -> dict[str, str]:
     """Metadata for a reader who has the file alone."""
     manifold, (name, _) = playback.manifold, TARGETS[phase]
-    told = {
+    properties = {
         "field": manifold.field,
         "phase": phase,
         "run": playback.run.id,
@@ -134,4 +134,4 @@ def _properties(playback: Playback, phase: str) -> dict[str, str]:
         "tau_order": list(TAU_ORDER),
         "x_sha256": manifold.x_sha256,
     }
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in told.items()}
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in properties.items()}

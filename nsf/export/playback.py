@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,21 +11,21 @@ import torch
 
 from nsf import config as configuration
 from nsf.bodies.colors import CLIP
-from nsf.config.scenes import recorded_scene
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
 from nsf.deployment import Rollout, continuation_file, rollout_file
-from nsf.dynamics import Decoder, Sources
+from nsf.dynamics import Decoder
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.errors import ConfigError, SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
 from nsf.evaluation.surroundings import surroundings
 from nsf.kinematics.interpolation import lying_together
-from nsf.kinematics.manifold import Manifold, Restriction
+from nsf.kinematics.manifold import Restriction
 from nsf.live import page
 from nsf.mpm import floor_height, precision_of
 from nsf.mpm.device import warp_device
+from nsf.pipeline import Pipeline
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.scenes import Scene
@@ -91,8 +92,7 @@ class Block:
 class Playback:
     """One reduced run of a deploy run: its frames, and its points at rest.
 
-    A playback reads the files of the deploy run and of its train run. It builds the scene where it needs
-    solids, points between the particles or the elastic law.
+    A playback reads the files of the deploy run and of its train run.
 
     Args:
         run: complete deploy run.
@@ -137,15 +137,13 @@ class Playback:
             raise ConfigError(f"color={color} is unknown; choose one of {', '.join(QUANTITIES)}")
         if not (fps > 0 and math.isfinite(fps)):
             raise ConfigError(f"fps={fps} must be positive and finite")
-        self.run, self.color, self.every, self.fps, self._settings = run, color, every, fps, run.config
-        index = _chosen(self._settings["cases"], parameter)
-        self._training = _parent(run).require()
-        self._warp_device = warp_device(device)
-        self.device = torch_device(self._warp_device)
-        self._precision = precision_of(self._settings["precision"])
+        self.run, self.color, self.every, self.fps = run, color, every, fps
+        index = _chosen(run.config["cases"], parameter)
+        self._pipeline = Pipeline.of_run(run, device, say=lambda line: None)
+        self.device = torch_device(warp_device(self._pipeline.device))
+        self._precision = precision_of(self._pipeline.config.precision)
         self._dtype = torch_dtype(self._precision)
-        self._sources = Sources(self._settings["stress"], self._settings["affine"])
-        self.manifold = Manifold.load(self._training.file("manifold.pt")).to(self.device)
+        self.manifold = self._pipeline.manifold().to(self.device)
         self._rollout = Rollout.open(run.file(rollout_file(index)), self.manifold.latent_dim)
         self.case, self._rest = self._rollout.case, continuation_file(index)
         if set(self.case) != set(self.manifold.parameter_names):
@@ -197,7 +195,7 @@ class Playback:
             rows = np.sort(np.random.default_rng(0).permutation(len(X))[:points])
         self.X, self._rows = X[rows], rows
         self._moduli = None
-        if not self._sources.neural_stress:
+        if not self._pipeline.sources.neural_stress:
             constants = constants or self._scene.particles()
             self._moduli = constants.mu[rows], constants.lam[rows]
 
@@ -249,8 +247,9 @@ class Playback:
 
     def thinned(self, points: int) -> "Playback":
         """The same frames at `points` of the particles, or at all particles if there are fewer."""
-        points = min(points, len(self.manifold.X))
-        return Playback(self.run, self.case, points, self.color, self.every, self.fps, str(self.device))
+        other = copy(self)
+        other._choose_points(min(points, len(self.manifold.X)))
+        return other
 
     @cached_property
     def tops(self) -> dict[str, float]:
@@ -308,8 +307,9 @@ class Playback:
         law = None, None, None
         if self._moduli is not None:
             law = self._scene.material, *(tensor(values[rows]) for values in self._moduli)
-        stress = self._sources.stress_of(at, parameters, *law, self._precision, self._warp_device)
-        return Decoder(at, stress, self._sources.affine_of(at, parameters))
+        sources, device = self._pipeline.sources, warp_device(self._pipeline.device)
+        stress = sources.stress_of(at, parameters, *law, self._precision, device)
+        return Decoder(at, stress, sources.affine_of(at, parameters))
 
     def _read(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         """x and τ of some of the points, in the frames of the full-order solver."""
@@ -321,7 +321,7 @@ class Playback:
     @cached_property
     def _scene(self) -> Scene:
         """The scene deployed on, in the run's case, for its shapes and law."""
-        return recorded_scene(self._settings).at(self.case)
+        return self._pipeline.deployed.at(self.case)
 
 
 def _rates(rollout: Rollout, frames: int) -> np.ndarray:
@@ -331,15 +331,6 @@ def _rates(rollout: Rollout, frames: int) -> np.ndarray:
         return np.zeros_like(xhat)
     changes = np.diff(xhat, axis=0)
     return np.concatenate([changes[:1], changes]) / (rollout.t[1] - rollout.t[0])
-
-
-def _parent(run: Run) -> Run:
-    """The first of the runs that a run was made from.
-
-    Raises:
-        MissingRunError: it is not there, or the run names none.
-    """
-    return Run.load(run.parents[0] if run.parents else "", run.root)
 
 
 def _chosen(cases: Sequence[Mapping[str, float]], parameter: Mapping[str, float] | float | str | None) -> int:

@@ -13,6 +13,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Forcing", "Model"]
 
-_HOMES = {"Forcing": "model", "Model": "model"}
-
 __getattr__ = on_first_use(__name__)

@@ -273,10 +273,10 @@ def _check_rows(path: Path | str, table: Mapping[str, np.ndarray], particles: in
     Raises:
         ConfigError: names the first such row.
     """
-    there = {name: ~np.isnan(table[name]) for name in COLUMNS if name != "quantity"}
-    placed, seen = (np.any([there[name] for name in names], axis=0) for names in (_POINT, AXES))
+    filled = {name: ~np.isnan(table[name]) for name in COLUMNS if name != "quantity"}
+    placed, seen = (np.any([filled[name] for name in names], axis=0) for names in (_POINT, AXES))
     scalar, particle = table["quantity"] != "", table["particle"]
-    whole = np.all([np.isfinite(table[name]) for name in _POINT], axis=0) | there["particle"]
+    whole = np.all([np.isfinite(table[name]) for name in _POINT], axis=0) | filled["particle"]
     valid = (np.floor(particle) == particle) & (particle >= 0) & (particle < particles)
     for wrong, message in (
         (
@@ -285,16 +285,16 @@ def _check_rows(path: Path | str, table: Mapping[str, np.ndarray], particles: in
         ),
         (scalar & ~np.isfinite(table["value"]), ": {quantity} has no value; give it [m]"),
         (
-            scalar & (placed | seen | there["particle"]),
+            scalar & (placed | seen | filled["particle"]),
             ": {quantity} stands beside a point (particle, X, Y, Z, x, y, z); give each its own row",
         ),
         (
-            ~scalar & there["value"],
+            ~scalar & filled["value"],
             ": value={value:g} is of no quantity; name it, or give x, y, z of a point",
         ),
         (~scalar & ~np.isfinite(table["t"]), " has no t; give the time [s] of a point's position"),
-        (placed & there["particle"], ": particle={particle:g} stands beside X, Y, Z; give one of them"),
-        (there["particle"] & ~valid, f": particle={{particle:g}} must be a whole number below {particles}"),
+        (placed & filled["particle"], ": particle={particle:g} stands beside X, Y, Z; give one of them"),
+        (filled["particle"] & ~valid, f": particle={{particle:g}} must be a whole number below {particles}"),
         (~scalar & ~whole, " names no point; give X, Y, Z at rest [m], or particle"),
         (~scalar & ~seen, " observes nothing; give x, y, z of the point [m], or leave the row out"),
     ):

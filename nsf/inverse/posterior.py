@@ -1,4 +1,4 @@
-"""The posterior of the parameters given observations, by a sampler that is kept."""
+"""The posterior of the parameters given observations, by emcee."""
 
 from dataclasses import dataclass
 
@@ -115,5 +115,5 @@ def posterior(
         length = steps / float(np.max(sampler.get_autocorr_time(discard=steps // 2, tol=0)))
         length = length if np.isfinite(length) else 0.0  # of walkers that stand still
     chain = sampler.get_chain(discard=steps // 2, flat=True)
-    kept = chain[np.linspace(0, len(chain) - 1, draws).round().astype(int)]
-    return Posterior(kept, steps, length, float(sampler.acceptance_fraction.mean()))
+    drawn = chain[np.linspace(0, len(chain) - 1, draws).round().astype(int)]
+    return Posterior(drawn, steps, length, float(sampler.acceptance_fraction.mean()))

@@ -1,6 +1,5 @@
 """Uncertainty: parameters drawn from stated distributions, and what runs by recurrence make of them."""
 
-import ast
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +11,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from nsf import words
 from nsf.data import Trajectory
 from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation.quantities import QUANTITIES
@@ -37,7 +37,7 @@ def distribution(text: str):
         ConfigError: there is no such distribution, or it refuses its numbers.
     """
     if len(ends := text.split("..")) == 2:
-        low, high = map(_number, ends)
+        low, high = (words.number("LOW..HIGH", end.strip()) for end in ends)
         if not low < high:
             raise ConfigError(f"{text} has nothing between its ends; give the smaller one first")
         return stats.uniform(low, high - low)
@@ -45,7 +45,7 @@ def distribution(text: str):
     family = getattr(stats, match[1], None) if match else None
     if not isinstance(family, stats.rv_continuous):
         raise ConfigError(f"{text} is no distribution; give one of scipy.stats, as norm(30,2), or LOW..HIGH")
-    numbers = [_number(part) for part in match[2].split(",")]
+    numbers = [words.number(match[1], part.strip()) for part in match[2].split(",")]
     try:
         frozen = family(*numbers)
         spread = frozen.std()
@@ -54,13 +54,6 @@ def distribution(text: str):
     if not (np.isfinite(spread) and spread > 0.0):
         raise ConfigError(f"{text} has no finite spread; see scipy.stats.{match[1]} for its numbers")
     return frozen
-
-
-def _number(text: str) -> float:
-    try:
-        return float(ast.literal_eval(text.strip()))
-    except (ValueError, SyntaxError, TypeError) as error:
-        raise ConfigError(f"{text.strip()!r} is no number") from error
 
 
 @dataclass(frozen=True)
@@ -91,7 +84,7 @@ class Prior:
                 continue
             each[name] = distribution(texts[name])
             if ".." in texts[name]:
-                Space.of(model, {name: [*map(_number, texts[name].split(".."))]})
+                Space.of(model, {name: each[name].support()})
         return cls(model, each)
 
     def values(self, u: np.ndarray) -> np.ndarray:

@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from nsf import schemas
 from nsf.errors import SchemaError
 from nsf.results import report, table
-from nsf.results.cases import COLORS
 from nsf.results.charts import CHARTS, View
+from nsf.results.charts.cases import COLORS
 from nsf.results.columns import COLUMNS
 from nsf.results.folder import MARK
 from nsf.results.formats import Rows, markdown_document

@@ -168,8 +168,8 @@ def _settings(frame: pd.DataFrame, sources: Mapping[str, Source], folder: Path) 
         if len(shown) > 1:
             stem = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', str(body))}-settings"
             drawn = save(final_shapes(shown), folder, stem, ("png",), [STRESS_COLORS, DIFFERENCE_COLORS])
-            told = "The last frame of one held-out case at several settings."
-            pictures.append(Picture(drawn, told, sorted(set(rows["run"]))))
+            caption = "The last frame of one held-out case at several settings."
+            pictures.append(Picture(drawn, caption, sorted(set(rows["run"]))))
     return pictures
 
 

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 
 from nsf.errors import ConfigError
 from nsf.results import table
-from nsf.results.cases import COLORS
 from nsf.results.charts import CHARTS, View
+from nsf.results.charts.bounds import BAD, GOOD, judged, promise
+from nsf.results.charts.cases import COLORS
 from nsf.results.columns import (
     ABSENT,
     COLUMNS,
@@ -28,7 +29,6 @@ from nsf.results.columns import (
 from nsf.results.folder import MARK, replaced
 from nsf.results.formats import Rows, latex_table, spreadsheet
 from nsf.results.page import Page, Picture, Section, Table, html_page, markdown_page
-from nsf.results.promise import BAD, GOOD, judged, promise
 from nsf.results.question import Question, made_of, plain
 from nsf.results.sources import KEPT, Source, checked_hash, file_hash, open_sources
 from nsf.results.style import save

@@ -1,7 +1,7 @@
 """Keys in which listed runs differ, their units, and the rows of a list."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -61,7 +61,7 @@ def setting(entry: Entry, key: str) -> Any:
 
 
 def case_of(entry: Entry) -> str | None:
-    """The parameter values of a simulation, or those that a run was deployed at."""
+    """The parameter of a simulation, or those that a run was deployed at; several values by their names."""
     cases = entry.settings.get("cases")
     if entry.run.stage == "simulate":
         values = {
@@ -72,7 +72,13 @@ def case_of(entry: Entry) -> str | None:
         cases = [values] if values else None
     if not (isinstance(cases, list) and all(isinstance(case, dict) for case in cases)):
         return None
-    return "; ".join(", ".join(map(text, case.values())) for case in cases)
+    return "; ".join(map(_case, cases))
+
+
+def _case(values: Mapping[str, Any]) -> str:
+    if len(values) == 1:
+        return text(next(iter(values.values())))
+    return ", ".join(f"{name}={text(value)}" for name, value in values.items())
 
 
 def records(listed: Sequence[Entry], named: Iterable[str] = ()) -> list[dict[str, Any]]:

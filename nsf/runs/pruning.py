@@ -23,7 +23,7 @@ _HOURS = {"h": 1, "d": 24, "w": 168}
 def dependents(runs: Iterable[Run]) -> dict[Run, set[Run]]:
     """The complete or running runs that were made from each run, by themselves or through others."""
     runs = list(runs)
-    found: dict[Run, set[Run]] = {}
+    needing: dict[Run, set[Run]] = {}
     for run in runs:
         if run.status not in ("complete", "running"):
             continue
@@ -31,23 +31,23 @@ def dependents(runs: Iterable[Run]) -> dict[Run, set[Run]]:
         while waiting:
             if (parent := waiting.pop()) not in seen:
                 seen.add(parent)
-                found.setdefault(parent, set()).add(run)
+                needing.setdefault(parent, set()).add(run)
                 waiting += parent.parent_runs
-    return found
+    return needing
 
 
-def prunable(asked: Sequence[Entry], everything: Sequence[Run], results: bool = False) -> list[Run]:
+def prunable(entries: Sequence[Entry], everything: Sequence[Run], results: bool = False) -> list[Run]:
     """Of some runs, those that no complete run depends on, unless that one goes as well, and no sweep needs.
 
     Args:
-        asked: the runs that may go.
+        entries: the runs that may go.
         everything: all runs.
         results: complete runs of the last stages may go, too.
     """
     needed = set().union(*(reserved(root) for root in {run.root for run in everything}))
     candidates = [
         entry.run
-        for entry in asked
+        for entry in entries
         if entry.run.status != "running"
         and entry.run.id not in needed
         and (results or not _is_result(entry.run))
@@ -55,10 +55,10 @@ def prunable(asked: Sequence[Entry], everything: Sequence[Run], results: bool = 
     of = dependents(everything)
     while True:
         going = set(candidates)
-        kept = [run for run in candidates if of.get(run, set()) <= going]
-        if len(kept) == len(candidates):
-            return kept
-        candidates = kept
+        left = [run for run in candidates if of.get(run, set()) <= going]
+        if len(left) == len(candidates):
+            return left
+        candidates = left
 
 
 def _is_result(run: Run) -> bool:
@@ -71,9 +71,9 @@ def older(entries: Iterable[Entry], age: str) -> list[Entry]:
     Raises:
         ConfigError: it is no age.
     """
-    if not (found := _AGE.fullmatch(age)):
+    if not (match := _AGE.fullmatch(age)):
         raise ConfigError(f"older={age} is no age; give hours, days or weeks, as 36h, 7d or 2w")
-    before = datetime.now(UTC) - timedelta(hours=float(found[1]) * _HOURS[found[2]])
+    before = datetime.now(UTC) - timedelta(hours=float(match[1]) * _HOURS[match[2]])
     return [e for e in entries if (at := e.values["created"]) and datetime.fromisoformat(at) < before]
 
 

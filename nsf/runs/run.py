@@ -92,7 +92,7 @@ class Run:
         """
         manifests = _root(root).glob(f"{stage or '*'}/{scene or '*'}/*/{MANIFEST}")
         names = (path.parts[-4:-1] for path in manifests)
-        runs = [cls(*own, _root(root)) for own in names if _is_run(own)]
+        runs = [cls(*parts, _root(root)) for parts in names if _is_run(parts)]
         return sorted(runs, key=lambda run: (run.manifest.get("created", ""), run.hash), reverse=True)
 
     @classmethod
@@ -126,16 +126,16 @@ class Run:
             if stage not in (None, path.parts[-3]):
                 raise MissingRunError(f"{path} is a {path.parts[-3]} run; name a {stage} run")
             return cls(*path.parts[-3:], path.parents[2])
-        there, beginning = cls.find(stage, root=root), name.strip("/")
+        recorded, beginning = cls.find(stage, root=root), name.strip("/")
         fit = [
             run
-            for run in there
+            for run in recorded
             if any(n.startswith(beginning) for n in (run.id, f"{run.scene}/{run.hash}", run.hash))
         ]
         if len(fit) != 1:
             kind = f"{stage} run" if stage else "run"
             what = f"{len(fit)} {kind}s begin with" if fit else f"no {kind} is, or begins with,"
-            raise MissingRunError(f"{what} {name!r} under {_root(root)}; {_listed(fit or there, stage)}")
+            raise MissingRunError(f"{what} {name!r} under {_root(root)}; {_listed(fit or recorded, stage)}")
         return fit[0]
 
     @property
@@ -259,9 +259,9 @@ class Run:
             SchemaError: the file is not recorded, is gone, or was changed since.
         """
         output = next((o for o in self.manifest.get("outputs", ()) if o["path"] == name), None)
-        if told := "is not recorded in its manifest" if output is None else altered(self.path, output):
+        if fault := "is not recorded in its manifest" if output is None else altered(self.path, output):
             raise SchemaError(
-                f"{self.path / name} {told}; delete the run's folder and run `nsf {self.stage}` again"
+                f"{self.path / name} {fault}; delete the run's folder and run `nsf {self.stage}` again"
             )
         return self.path / name
 
@@ -291,8 +291,8 @@ class Run:
         """Faults of the folder, a line each; every recorded file is held to its sha256."""
         if fault := self.fault:
             return [f"{self.path}: {fault}"]
-        found = ((o["path"], altered(self.path, o)) for o in self.manifest.get("outputs", ()))
-        return [f"{self.path / name} {told}" for name, told in found if told]
+        faults = ((o["path"], altered(self.path, o)) for o in self.manifest.get("outputs", ()))
+        return [f"{self.path / name} {fault}" for name, fault in faults if fault]
 
     @contextmanager
     def claimed(self, say: Callable[[str], object] | None = None) -> Iterator[bool]:
@@ -301,7 +301,8 @@ class Run:
         Look whether the run is complete inside the block: another process may have made it meanwhile.
 
         Args:
-            say: told that another process makes the run, which is then waited for; None does not wait.
+            say: called with a line where another process makes the run, which is then waited for; None does
+                not wait.
 
         Yields:
             Whether the run is claimed; False only where another process makes it and nothing is waited for.
@@ -309,8 +310,8 @@ class Run:
         Raises:
             StorageError: the folder cannot be written.
         """
-        told = f"{self.stage}: waiting for another process, which is making {self.id}"
-        with locked(self.path / _LOCK, None if say is None else lambda: say(told)) as claimed:
+        line = f"{self.stage}: waiting for another process, which is making {self.id}"
+        with locked(self.path / _LOCK, None if say is None else lambda: say(line)) as claimed:
             yield claimed
 
     @contextmanager
@@ -351,7 +352,7 @@ class Run:
             **({"warnings": list(warnings)} if warnings else {}),
         }
         record = Record(self.path, manifest)
-        with self.claimed(lambda told: None):
+        with self.claimed(lambda line: None):
             clear_partial(self.path)
             self._write_config()
             with record.kept():

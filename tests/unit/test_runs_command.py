@@ -95,8 +95,8 @@ def test_cases_of_several_parameters_are_numbered(root, nsf):
         of = {name: {"key": f"material.{name}", "value": v} for name, v in (("E", E), ("nu", 0.3))}
         made("simulate", {"parameters": of}, scene="block")
     _, out, _ = nsf("scene=block")
-    assert [row[-1] for row in rows(out)[1:3]] == ["1", "2"]
-    assert "case 1: 2, 0.3" in out
+    assert [row[-1] for row in rows(out)[1:3]] == ["#1", "#2"]
+    assert "case #1: E=2, nu=0.3" in out
 
 
 def test_other_programs_read_json_and_csv(root, nsf):

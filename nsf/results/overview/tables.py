@@ -54,7 +54,8 @@ class Column:
 
 def columns(listed: Sequence[Entry], named: Sequence[str] = ()) -> tuple[list[Column], list[str]]:
     """The fields of runs, and keys in which they differ or that are named; further keys that differ."""
-    keys = differing(listed, named)
+    mains = {MAIN[entry.run.stage][0] if entry.run.stage in MAIN else "" for entry in listed}
+    keys = differing(listed, [key for key in named if mains != {key}])  # the metric is there already
     more = [key for key in keys if key not in TITLES and key not in named][_MOST:]
     return [Column(key) for key in (*FIELDS, *keys) if key not in more], more
 
@@ -90,7 +91,7 @@ def runs_table(listed: Sequence[Entry], named: Sequence[str] = (), width: int = 
     narrow = [column.title for column in every if column not in shown and column not in shared]
     lines = [
         f"The same in all: {', '.join(said)}" if said else "",
-        *(f"case {k}: {case}" for case, k in legend.items()),
+        *(f"case {number}: {case}" for case, number in legend.items()),
         f"Hidden for want of width: {', '.join(narrow)}" if narrow else "",
         f"These differ as well, and have a column with KEY=*: {', '.join(more)}" if more else "",
     ]
@@ -98,18 +99,18 @@ def runs_table(listed: Sequence[Entry], named: Sequence[str] = (), width: int = 
 
 
 def _numbered(texts: dict[Column, list[str]]) -> dict[str, str]:
-    """Put numbers in place of cases of several values, which are long; gives the number of each case."""
+    """Put numbers in place of cases of several values, which are long; gives the number of each."""
     cases = texts.get(Column(CASE), [])
-    if not any("," in case or ";" in case for case in cases):
-        return {}
-    legend = {case: str(k) for k, case in enumerate(dict.fromkeys(cases), 1)}
-    texts[Column(CASE)] = [legend[case] for case in cases]
+    several = dict.fromkeys(case for case in cases if "=" in case or ";" in case)
+    legend = {case: f"#{k}" for k, case in enumerate(several, 1)}
+    if cases:
+        texts[Column(CASE)] = [legend.get(case, case) for case in cases]
     return legend
 
 
 def _rank(key: str, named: Sequence[str]) -> int:
     """The order in which columns take the room that there is."""
-    order = ("id", "metric", "", "status", "scene", "stage", "seconds", "created")
+    order = ("id", "metric", "stage", "scene", "", "status", "seconds", "created")
     return 1 if key in named else order.index(key if key in order else "")
 
 

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 from made import STAGES, Made, frame
 
-from nsf.results import cases, charts, table
-from nsf.results.charts import CHARTS, View
+from nsf.results import table
+from nsf.results.charts import CHARTS, View, cases, errors
+from nsf.results.charts import view as register
 
 PLANE = tuple(
     f"E={e} Pa, density={d} kg/m³, program={p}" for p, (e, d) in enumerate(((5, 1), (6, 2), (7, 3)))
@@ -59,7 +60,7 @@ def test_a_chart_is_left_out_where_there_is_nothing_of_its_kind(name):
 
 def test_every_program_is_a_dot_beside_its_rivals():
     rows = table.labelled(table.complete(frame(Made((0.01, np.inf), PLANE[:2])), "here"))
-    panel = charts.programs(View(rows))["programs"].axes[0]
+    panel = errors.programs(View(rows))["programs"].axes[0]
     dots = {y: line.get_xdata() for line in panel.lines if (y := line.get_ydata()[0]) == line.get_ydata()[-1]}
     names = [text.get_text().replace("\n", " ") for text in panel.get_yticklabels()]
     assert names[:2] == ["projected", "nothing moves"]
@@ -69,27 +70,27 @@ def test_every_program_is_a_dot_beside_its_rivals():
 
 def test_a_run_that_diverged_leaves_a_gap_and_is_said():
     rows = table.labelled(table.complete(frame(Made((0.01, np.inf)), Made(model="recurrence")), "here"))
-    panel = charts.delta(View(rows))["delta"].axes[0]
+    panel = errors.delta(View(rows))["delta"].axes[0]
     assert [text.get_text() for text in panel.texts] == ["diverged"]
 
 
 def test_the_baseline_has_one_name_in_charts():
     rows = [Made(), Made(stress="deformation", affine="none")]
     shown = View(table.labelled(table.complete(frame(*rows), "here")))
-    panel = charts.delta(shown)["delta"].axes[0]
+    panel = errors.delta(shown)["delta"].axes[0]
     names = [text.get_text() for text in panel.get_yticklabels()]
     assert names == ["deformation only (baseline)", "projected"]
 
 
 def test_a_chart_is_added_by_one_function(monkeypatch):
-    monkeypatch.setattr(charts, "CHARTS", {})
+    monkeypatch.setattr(register, "CHARTS", {})
 
-    @charts.chart("Nothing.")
+    @register.chart("Nothing.")
     def mine(view):
         return {"mine": None}
 
-    assert charts.CHARTS["mine"].draw(None) == {"mine": None}
-    assert charts.CHARTS["mine"].caption == "Nothing."
+    assert register.CHARTS["mine"].draw(None) == {"mine": None}
+    assert register.CHARTS["mine"].caption == "Nothing."
 
 
 def test_lost_runs_are_no_colour_of_a_map():

@@ -3,7 +3,8 @@
 import numpy as np
 import pandas as pd
 
-from nsf.results.charts import ERROR, Figures, View, chart
+from nsf.results.charts.drawing import ERROR
+from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import COLUMNS
 from nsf.results.style import INK, LOST, MUTED, PALETTE, legend, panels, plain_ticks
 

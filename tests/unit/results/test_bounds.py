@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from nsf.results.charts import View
-from nsf.results.promise import error_bounds, promise
+from nsf.results.charts.bounds import error_bounds, promise
 
 ROWS = pd.DataFrame(
     {

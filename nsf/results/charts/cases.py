@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 
 from nsf.data.case import PROGRAM, Case
 from nsf.errors import ConfigError
-from nsf.results.charts import ERROR, Figures, View, chart, whole_mean
+from nsf.results.charts.drawing import ERROR, lines, whole_mean
+from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import axis, number
 from nsf.results.style import (
     INK,
@@ -25,7 +26,6 @@ from nsf.results.style import (
     error_scale,
     figure,
     legend,
-    line_style,
     panels,
     plain_ticks,
 )
@@ -49,12 +49,12 @@ def error_over_parameters(view: View) -> Figures:
     planes = [(body, part, name) for body, part, names in _several(view) for name in names]
     if not planes:
         return {}
-    models = list(dict.fromkeys(view.frame["variant"]))
+    styles = lines(view.frame["variant"])
     fig, drawn = panels(len(planes), 3.0, 3)
     for panel, (body, part, name) in zip(drawn, planes, strict=True):
         for variant, rows in part.groupby("variant", sort=False):
-            style = line_style(models.index(variant)) | {"label": variant}
-            _neighbours(panel, rows.groupby(name)["error"].mean(), style, name in view.logarithmic)
+            errors = rows.groupby(name)["error"].mean()
+            _neighbours(panel, errors, styles[variant], name in view.logarithmic)
         panel.set_title(body, pad=14)
         panel.set(ylabel=ERROR)
         _scaled(panel, "x", part, name, name in view.logarithmic)
