@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from nsf.bodies.colors import (
-    CLIP,
     DIFFERENCE_COLORS,
     ROLES,
     SIGNED_COLORS,
@@ -44,13 +43,10 @@ class Coloring:
 
     def __init__(self, model: LiveModel):
         self._model = model
-        x, tau = model.training_frames()
-        moved = float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5)) or 1.0
-        equivalent, mean = (_of_stress(law, tau) for law in (von_mises, pressure))
-        stress, mean = (float(np.percentile(abs(v), CLIP)) or 1.0 for v in (equivalent, mean))
+        tops, moved = model.tops, model.tops["displacement"]
         self.quantities = {
-            STRESS: _scale("von Mises stress", "Pa", stress, STRESS_COLORS),
-            PRESSURE: _scale("pressure", "Pa", mean, SIGNED_COLORS, signed=True),
+            STRESS: _scale("von Mises stress", "Pa", tops["von_mises"], STRESS_COLORS),
+            PRESSURE: _scale("pressure", "Pa", tops["pressure"], SIGNED_COLORS, signed=True),
             DISPLACEMENT: _scale("displacement", "m", moved, STRESS_COLORS),
             DISTANCE: _scale("distance to the full-order run", "m", _DISTANCE * moved, DIFFERENCE_COLORS),
             SETS: {

@@ -4,21 +4,24 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 
+from nsf.bodies.colors import CLIP
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY, packed
 from nsf.deployment import TRUST, Trust, Verdict
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
+from nsf.evaluation.metrics import pressure, von_mises
 from nsf.live import page
 from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
 from nsf.runs import Run
-from nsf.scenes.programs import tilted
+from nsf.scenes.programs import largest_tilt, tilted
 
 #: Precision of live runs, whatever the deployment's: a CPU reads half as much a step. On the sand column this
 #: moves no particle by more than a thousandth of the displacement.
@@ -29,6 +32,7 @@ _BEYOND = 0.5
 _STEPS = 200
 #: Share of the particles that are shown which lie at the surface, where there are so many.
 _OUTER = 0.7
+_CLIP = 99.5  # [%] percentile of the displacement at which its scale ends
 _SNAPSHOTS = 64  # training snapshots that bounds and colour scales are taken from
 
 
@@ -277,10 +281,10 @@ class LiveModel:
     @property
     def tilt(self) -> float | None:
         """Largest tilt of gravity that programs of training may give [rad]; None where they give none."""
-        taught, size = self.trust.reach, float(np.linalg.norm(self.trust.reach.gravity))
-        if not self.pipeline.scene.forcing.gravity or not size:
+        gravity, reach = np.array(self.pipeline.deployed.gravity), self.trust.reach
+        if not self.pipeline.scene.forcing.gravity or not np.any(gravity):
             return None
-        return float(2.0 * np.arcsin(min(1.0, 0.5 * taught.radius / size)))
+        return largest_tilt(gravity, np.array(reach.gravity), reach.radius)
 
     def tilted(self, run: LiveRun, step: int, tilt: Sequence[float]) -> LiveRun:
         """A run that goes on from a step of another under gravity that a hand has tilted.
@@ -324,6 +328,19 @@ class LiveModel:
         role[sets.integration], role[sets.sample] = 1, 2
         return role[self.shown]
 
+    @cached_property
+    def tops(self) -> dict[str, float]:
+        """Ends of the colour scales of `displacement` [m], `von_mises` and `pressure` [Pa]."""
+        x, tau = self.training_frames
+        tau = torch.as_tensor(tau)
+        tops = {
+            "displacement": np.percentile(np.linalg.norm(x - self.X, axis=2), _CLIP),
+            "von_mises": np.percentile(von_mises(tau), CLIP),
+            "pressure": np.percentile(pressure(tau).abs(), CLIP),
+        }
+        return {name: float(top) or 1.0 for name, top in tops.items()}
+
+    @cached_property
     def training_frames(self) -> tuple[np.ndarray, np.ndarray]:
         """x [F, n, 3] m and τ [F, n, 6] Pa of some training snapshots, evaluated by the fields."""
         latents = self.manifold.training_latents

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nsf.bodies.colors import CLIP
 from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.data.trajectory import Trajectory
@@ -23,6 +22,7 @@ from nsf.recurrence import Form, RecurrenceEngine, first_change
 from nsf.results.formats import file_name
 from nsf.runs import Run
 from nsf.scenes import Scene
+from nsf.scenes.programs import largest_tilt
 from nsf.storage import writing
 from nsf.vectors import spaced
 
@@ -31,6 +31,7 @@ POINTS = 20_000
 #: Largest page [bytes], which still goes by mail.
 LARGEST = 16_000_000
 _SAME = 1e-9
+_LEAST_TILT = 0.05  # [rad] that the page offers where programs tilt gravity
 
 
 def write(run: Run, folder: Path, points: int | None = None, device: str = "auto") -> Path:
@@ -160,12 +161,8 @@ def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes, stress: 
     kinds: dict[str, tuple[type, int | None]] = {"deformation": (np.int16, sizes.modes)}
     if model.pipeline.sources.neural_stress or stress:
         kinds["stress"] = np.int8, max(stress, 1, sizes.stress // (6 * len(model.X)))
-        _, tau = model.training_frames()
-        top = float(np.percentile(von_mises(torch.as_tensor(tau)).numpy(), CLIP)) or 1.0
-        title = "von Mises stress"
-        header["quantities"] = {"von_mises": {"title": title, "unit": "Pa", "top": top}} | header[
-            "quantities"
-        ]
+        stress_scale = {"title": "von Mises stress", "unit": "Pa", "top": model.tops["von_mises"]}
+        header["quantities"] = {"von_mises": stress_scale} | header["quantities"]
     for phase, how in kinds.items():
         description, values = modal_field(model.at.fields[phase], *how)
         descriptions[phase] = description | {"parameters": model.manifold.takes_parameters(phase)}
@@ -211,12 +208,10 @@ def _tilt(model: LiveModel, recurrence: RecurrenceEngine) -> dict | None:
     """
     scene, taught = model.pipeline.deployed, recurrence.taught
     down = np.array(scene.gravity)
-    size = float(np.linalg.norm(down))
-    if not recurrence.form.sizes.gravity or not size or not scene.forcing.gravity:
+    if not recurrence.form.sizes.gravity or not np.any(down) or not scene.forcing.gravity:
         return None
-    # A ball about the mean of what was taught; its rim is nearest where the mean is off to one side.
-    reach = max(taught.reach - float(np.linalg.norm(down - taught.gravity)), 0.05 * size)
-    return {"down": down.tolist(), "angle": float(2.0 * np.arcsin(min(1.0, 0.5 * reach / size)))}
+    angle = largest_tilt(down, np.array(taught.gravity), taught.reach)
+    return {"down": down.tolist(), "angle": max(angle, _LEAST_TILT)}
 
 
 def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) -> list[dict]:

@@ -29,8 +29,8 @@ def field_message(model: LiveModel) -> bytes:
 
 def shown(model: LiveModel) -> dict:
     """The part of the header that every page of a model has."""
-    x, _ = model.training_frames()
-    moved = float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5)) or 1.0
+    x, _ = model.training_frames
+    moved = model.tops["displacement"]
     return {
         "title": model.title,
         "run": model.run.id,
