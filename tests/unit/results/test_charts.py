@@ -16,6 +16,7 @@ PLANE = tuple(
 )
 #: What each chart needs to have something to draw.
 NEEDS = {
+    "error_bounds": {"error_bound": [0.02, 0.03, 0.04, 0.05], "fallback_share": 0.0},
     "programs": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
     "delta_over": {"setting": ["sampler.size=12", "sampler.size=12", "sampler.size=50", "sampler.size=50"]},
     "step_over_particles": {"particles": [1000, 1000, 9000, 9000]},
