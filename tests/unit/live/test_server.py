@@ -452,7 +452,7 @@ def test_the_field_is_smaller_than_its_numbers_and_a_frame_than_particles(model)
     field = model.at.fields["deformation"]
     assert len(field_message(model)) < field.modes.numel() * 2 + 2 * field.mean.nbytes + 20_000
     frame = LatentFeed(model).frame(Player(model).tick())
-    assert len(frame) == 4 * (2 + model.manifold.latent_dim)
+    assert len(frame) == 4 * (3 + model.manifold.latent_dim)
 
 
 def test_a_field_that_is_no_modes_is_refused(model):
