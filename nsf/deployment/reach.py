@@ -147,6 +147,6 @@ class Reach:
 
 def velocities(states: np.ndarray, dt: float) -> np.ndarray:
     """States [..., f] of solids with velocities in place of changes in a step of dt [s]."""
-    rows = states.reshape(*states.shape[:-1], -1, FEATURES).copy()
+    rows = states.reshape(*states.shape[:-1], states.shape[-1] // FEATURES, FEATURES).copy()
     rows[..., 4:8] /= dt
     return rows.reshape(states.shape)

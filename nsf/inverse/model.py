@@ -18,6 +18,7 @@ from nsf.kinematics.manifold import Restriction
 from nsf.models import Recurrence
 from nsf.pipeline import Pipeline
 from nsf.recurrence import RecurrenceEngine, collider_states, first_change
+from nsf.recurrence.engine import between
 from nsf.runs import Run
 
 
@@ -188,19 +189,20 @@ class Model:
         mu = self.tensor(parameters).detach()
         rows = mu.reshape(-1, mu.shape[-1])
         with torch.no_grad():
-            path = member_runs(self._form, *self._start_and_forcing(rows, forcing))  # [n, M, B, r]
+            inputs, k = self._start_and_forcing(rows, forcing), self._form.stride
+            path = member_runs(self._form, *inputs).permute(2, 1, 0, 3)  # [B, M, n, r] at strides
+            runs = between(path.mean(1), inputs[1], k).cpu().numpy()
         acting = forcing or Forcing(self._of("gravity", rows), self._of("solids", rows))
         gravity, solids = (
             values.detach().cpu().expand(len(rows), *values.shape[-2:]).numpy()
             for values in (acting.gravity, acting.solids)
         )
-        members, t = path.permute(2, 1, 0, 3).cpu().numpy(), self.t[:: self._form.stride]
-        bounds = []
-        for values, paths, *forced in zip(rows.tolist(), members, gravity, solids, strict=True):
-            case, xhat = dict(zip(self.names, values, strict=True)), paths.mean(0)
-            signal = self.trust.signal(xhat, paths if len(paths) > 1 else None)
+        members, bounds = path.cpu().numpy(), []
+        for values, xhat, paths, *forced in zip(rows.tolist(), runs, members, gravity, solids, strict=True):
+            case, several = dict(zip(self.names, values, strict=True)), len(paths) > 1
+            signal = self.trust.signal(xhat[::k], paths if several else None)
             outside = self.trust.reach.of_inputs(case, *forced, self.dt)
-            verdict = self.trust.judge(case, t, xhat, signal, outside)
+            verdict = self.trust.judge(case, self.t, xhat, np.interp(self.t, self.t[::k], signal), outside)
             bounds.append(np.inf if verdict.beyond else verdict.bound_share)
         return np.reshape(bounds, mu.shape[:-1])
 

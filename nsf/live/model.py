@@ -115,10 +115,7 @@ class LiveRun:
         self._xhat = np.zeros((self.steps + 1, solver.manifold.latent_dim), np.float32)
         self._shat: np.ndarray | None = None
         self._signal = np.zeros(self.steps + 1)
-        self._outside: tuple[int, str] = (
-            self.steps + 1,
-            "",
-        )  # step, and why the inputs are outside from there
+        self._outside = 0, trust.outside(solver)  # step from which on inputs are outside, and why
         self._xhat[0] = solver.state.xhat
         self.reached, self.seconds, self.diverged = 0, 0.0, False
 
