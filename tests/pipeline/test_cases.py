@@ -73,7 +73,7 @@ def test_results_name_the_cases(made):
 
 def test_a_report_names_the_cases(made, monkeypatch):
     monkeypatch.setattr("nsf.results.pictures._MANY", 0)  # a picture of a variant
-    charts = {name: CHARTS[name] for name in ("delta", "error_over_parameters")}
+    charts = {name: CHARTS[name] for name in ("delta", "latent")}
     monkeypatch.setattr("nsf.results.report.CHARTS", charts)
     pipeline, _ = made
     page = pipeline.report()
@@ -107,7 +107,7 @@ def test_both_parameters_are_steered(made):
     assert player.case == pipeline.scene.case([30.0, 2000.0])
     with pytest.raises(ConfigError, match="1 values must be 2"):
         player.steer([30.0])
-    assert model.start(pipeline.scene.case([60.0, 2000.0])).away > 1.0
+    assert model.start(pipeline.scene.case([60.0, 2000.0])).verdict(0).beyond
 
 
 def test_lessons_fill_the_box_of_training(pipeline_at, tmp_path):
