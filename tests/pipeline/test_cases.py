@@ -107,7 +107,9 @@ def test_both_parameters_are_steered(made):
     assert player.case == pipeline.scene.case([30.0, 2000.0])
     with pytest.raises(ConfigError, match="1 values must be 2"):
         player.steer([30.0])
-    assert model.start(pipeline.scene.case([60.0, 2000.0])).verdict(0).beyond
+    run = model.start(pipeline.scene.case([60.0, 2000.0]))
+    run.advance(1)
+    assert run.verdict(1).beyond
 
 
 def test_lessons_fill_the_box_of_training(pipeline_at, tmp_path):
