@@ -117,25 +117,6 @@ def pipeline_at():
 
 
 @pytest.fixture(scope="session")
-def made_once(tmp_path_factory):
-    """(name, make) → a folder that `make` has filled, once for all workers; not to be changed."""
-    from nsf.storage import locked
-
-    root = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:  # of each worker is a folder in that of all
-        root = root.parent
-
-    def give(name, make):
-        folder = root / name
-        with locked(root / f".{name}.lock", waiting=lambda: None):
-            if not folder.exists():
-                make(folder)
-        return folder
-
-    return give
-
-
-@pytest.fixture(scope="session")
 def chain(tmp_path_factory) -> Chain:
     """The tiny chain, made once."""
     said: list[str] = []

@@ -147,7 +147,7 @@ def test_manifests(chain):
     assert (metrics["needed_outside"], metrics["engine"], metrics["engine_why"]) == (0, "modal", "")
 
 
-def test_the_manifold_knows_its_data(chain, tiny_manifold):
+def test_the_manifold_knows_its_data(tiny_manifold):
     assert sorted(set(tiny_manifold.training_parameters.flatten().tolist())) == [22.0, 30.0, 38.0]
 
 

@@ -100,7 +100,7 @@ def test_a_bad_trajectory(refused, copied, pipeline_at, spoil, quoted, replace):
     assert not [r for r in Run.find("train", root=root) if r.complete]
 
 
-def test_a_trajectory_cut_short_is_simulated_again(copied, pipeline_at, refused, chain):
+def test_a_trajectory_cut_short_is_simulated_again(copied, pipeline_at, refused):
     root = copied("simulate")
     run = pipeline_at(root).simulation(angle(30.0))
     whole = (run.path / "trajectory.h5").read_bytes()

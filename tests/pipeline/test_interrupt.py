@@ -50,7 +50,7 @@ def same_weights(path, other):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_control_c(nsf, copied, pipeline_at, chain, stage):
+def test_control_c(nsf, copied, pipeline_at, stage):
     root = copied(*STAGES[: STAGES.index(stage)])
     outcome = nsf(stage, root, faults=[MOMENTS[stage]])
     assert outcome.code == 130, outcome.err

@@ -61,7 +61,7 @@ def reduced(lesson, taught):
 # -- the stage ------------------------------------------------------------------------------------------
 
 
-def test_the_chain(lesson, chain):
+def test_the_chain(lesson):
     pipeline, said = lesson
     assert [line.split(":")[0] for line in said if "warning" not in line] == [
         "teach",

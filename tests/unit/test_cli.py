@@ -177,7 +177,7 @@ def test_a_malformed_search_is_one_line(nsf, words, told):
     assert told in err
 
 
-def test_an_error_steers_no_terminal(nsf, monkeypatch):
+def test_an_error_steers_no_terminal(nsf):
     """A value that quotes control characters is shown with their names."""
     from nsf.errors import ConfigError, DeviceError
 

@@ -79,7 +79,7 @@ def test_points_of_a_category_are_seen_through_the_others():
         assert (picture[..., 0] > picture[..., 1] + 80).any() == seen
 
 
-def test_every_point_of_many_may_be_drawn(tmp_path):
+def test_every_point_of_many_may_be_drawn():
     body = fallen(200_000)
     stage = Stage([body])
     picture = stage.picture(stage.view(200), body, 0)

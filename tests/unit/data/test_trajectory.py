@@ -291,7 +291,7 @@ def refused_by_all(paths):
                 read(path)
 
 
-def test_heaps_without_an_end_are_refused_before_hdf5_walks_them(write, tmp_path):
+def test_heaps_without_an_end_are_refused_before_hdf5_walks_them(write):
     """An object of no size, in texts of attributes or where a virtual data set names its files; a free place
     that leads to itself. HDF5 walks the first two for ever and fills the memory with the third."""
     paths = [write(f"{name}.h5")[0] for name in ("texts", "virtual", "names")]

@@ -277,7 +277,7 @@ def test_sets_start_with_the_sample(solver_of, corner):
 # -- spans ----------------------------------------------------------------------------------------------
 
 
-def test_a_change_of_span_keeps_the_velocity(solver_of, chain):
+def test_a_change_of_span_keeps_the_velocity(solver_of):
     """A second span of the same particles changes nothing: the backward difference goes across it."""
     plain = RandomSampler(20, seed=3)
     phased = RandomSampler(20, seed=3, phases=[{"start": 0.25, "size": 20}, {"start": 0.7, "size": 20}])

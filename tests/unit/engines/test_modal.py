@@ -167,7 +167,7 @@ def test_more_samples_than_a_block_has_threads(pair):
     same(*runs(pair(200), steps=6))
 
 
-def test_cubic_splines(chain, tiny, pair):
+def test_cubic_splines(tiny, pair):
     scene = nsf.load_scene("sand", [*tiny[1:], "transfer.shape=cubic"])
     same(*runs(pair(scene=scene), steps=6))
 

@@ -99,7 +99,7 @@ def seen(tmp_path, model, deployed):
     return csv(tmp_path, rows), case
 
 
-def test_calibrate(tmp_path, deployed, seen, capsys):
+def test_calibrate(tmp_path, deployed, seen):
     file, case = seen
     folder = tmp_path / "reports" / "heap"
     page = calibrate(

@@ -92,7 +92,7 @@ def test_many_snapshots_have_the_same_modes_without_their_gram_matrix(many, monk
     torch.testing.assert_close(modes.T @ modes, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-9)
 
 
-def test_of_many_snapshots_a_step_sees_some(low_rank, monkeypatch, tmp_path):
+def test_of_many_snapshots_a_step_sees_some(low_rank, monkeypatch):
     monkeypatch.setattr(schedules, "MOST_AT_ONCE", M - 1)
     monkeypatch.setattr(schedules, "DRAWN", 7)
     seen = []

@@ -26,7 +26,7 @@ def run(model):
     return whole(model, 26.0)
 
 
-def test_it_is_the_deployed_run(chain, model, run):
+def test_it_is_the_deployed_run(chain, run):
     deployed = Rollout.open(chain.pipeline.deployment.path / "rollout_0.h5")
     assert run.reached == run.steps == len(deployed.t) - 1
     found = np.stack([run.xhat(n) for n in range(run.steps + 1)])

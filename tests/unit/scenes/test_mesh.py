@@ -80,7 +80,7 @@ class TestInside:
 
 
 class TestLinesThroughEdgesAndCorners:
-    def test_cube_of_aligned_faces(self, tmp_path):
+    def test_cube_of_aligned_faces(self):
         """Every line passes vertices, edges or diagonals of the 3-fold subdivided cube."""
         box = Box((0.25, 0.25, 0.25), (0.75, 0.75, 0.75))
         parts = [

@@ -168,7 +168,7 @@ class TestPolygons:
         ],
         ids=["arrow", "L", "corners on edges", "two slots", "bridge"],
     )
-    def test_concave(self, tmp_path, outline, area):
+    def test_concave(self, outline, area):
         """From each first corner, from below, and turned in space."""
         for shift, turn in itertools.product(range(len(outline)), (0.0, 0.9)):
             vertices, faces = prism(outline[shift:] + outline[:shift])
