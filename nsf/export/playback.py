@@ -13,7 +13,7 @@ from nsf import config as configuration
 from nsf.bodies.colors import CLIP
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
-from nsf.deployment import Rollout, continuation_file, rollout_file
+from nsf.deployment import FULL_ORDER, Rollout, continuation_file, rollout_file
 from nsf.dynamics import Decoder
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.errors import ConfigError, SchemaError
@@ -114,7 +114,7 @@ class Playback:
 
     Raises:
         ConfigError: the case was not deployed; a number is not positive; or points between the particles are
-            asked of a run that the full-order solver went on with, a part that has no fields.
+            asked of a run by the full-order solver, which has no fields.
         MissingRunError: the train run is not whole.
         SchemaError: the reduced run has other parameters than its manifold.
         DeviceError: there is no such device.
@@ -145,7 +145,9 @@ class Playback:
         self._dtype = torch_dtype(self._precision)
         self.manifold = self._pipeline.manifold().to(self.device)
         self._rollout = Rollout.open(run.file(rollout_file(index)), self.manifold.latent_dim)
-        self.case, self._rest = self._rollout.case, continuation_file(index)
+        self.case = self._rollout.case
+        taken = self._rollout.by == FULL_ORDER  # from its beginning
+        self._full_order = run.file(continuation_file(index)) if taken else None
         if set(self.case) != set(self.manifold.parameter_names):
             raise SchemaError(
                 f"{run.path} is of {', '.join(self.case)}, and its manifold of "
@@ -157,34 +159,26 @@ class Playback:
 
     def _choose_frames(self) -> None:
         rollout = self._rollout
-        diverged, handed_over = rollout.diverged, rollout.handed_over
-        t = rollout.t if diverged < 0 else rollout.t[:diverged]
-        reduced = len(t)  # frames of the reduced run; the full-order solver made the later ones
-        if handed_over >= 0:
-            reduced = handed_over + 1
-            with Trajectory.open(self.run.file(self._rest)) as rest:
-                t = np.concatenate([t[:reduced], rest.t[1:]])
-        chosen = np.union1d(np.arange(0, len(t), self.every), len(t) - 1)
-        self.stopped = float(rollout.t[diverged]) if diverged >= 0 else None
-        self.t = t[chosen]
-        self._xhat = torch.as_tensor(
-            rollout.xhat[chosen[chosen < reduced]], dtype=self._dtype, device=self.device
-        )
-        self._shat = (
-            None if rollout.stress is None else torch.as_tensor(rollout.stress[chosen[chosen < reduced]])
-        )
-        self._rate = _rates(rollout, max(reduced, 2))[chosen[chosen < reduced]]
-        self._later = chosen[chosen >= reduced] - (reduced - 1)  # its first frame is reduced
+        t = rollout.t if rollout.diverged < 0 else rollout.t[: rollout.diverged]
+        if self._full_order:
+            with Trajectory.open(self._full_order) as trajectory:
+                t = trajectory.t
+        self._frames = np.union1d(np.arange(0, len(t), self.every), len(t) - 1)
+        self.t = t[self._frames]
+        self.stopped = float(rollout.t[rollout.diverged]) if rollout.diverged >= 0 else None
+        steps = self._frames[:1] if self._full_order else self._frames
+        self._xhat = torch.as_tensor(rollout.xhat[steps], dtype=self._dtype, device=self.device)
+        self._shat = None if rollout.stress is None else torch.as_tensor(rollout.stress[steps])
+        self._rate = _rates(rollout)[steps]
 
     def _choose_points(self, points: int | None) -> None:
         X = self.manifold.X.cpu().numpy()
         rows, constants = np.arange(len(X)), None
         self._between = points is not None and points > len(X)
         if self._between:
-            if len(self._later):
+            if self._full_order:
                 raise ConfigError(
-                    f"points={points}: the full-order solver went on with this run at "
-                    f"t = {self._rollout.t[self._rollout.handed_over]:.4g} s, and has its {len(X)} particles "
+                    f"points={points}: the full-order solver took this run, and has its {len(X)} particles "
                     "alone; leave points out, or deploy with fallback=none"
                 )
             constants = self._scene.resampled(points).particles()
@@ -211,7 +205,7 @@ class Playback:
 
     @property
     def xhat(self) -> np.ndarray:
-        """[F, r] latent vectors of the reduced run, without the frames of the full-order solver."""
+        """[F, r] latent vectors of the reduced run; of one by the full-order solver the first alone."""
         return self._xhat.cpu().numpy()
 
     @property
@@ -288,12 +282,7 @@ class Playback:
         size = max(1, min(POINTS, BLOCK // len(self.t)))
         for start in range(0, len(self.X), size):
             rows = slice(start, min(start + size, len(self.X)))
-            with torch.no_grad():
-                decoder = self._decoder(rows)
-                x = decoder.position(self._xhat).cpu()
-                tau = decoder.stress(self._xhat, self._shat)[..., TAU_ROWS, TAU_COLUMNS].cpu()
-            if len(self._later):
-                x, tau = (torch.cat([a, b.to(a)]) for a, b in zip((x, tau), self._read(rows), strict=True))
+            x, tau = self._read(rows) if self._full_order else self._evaluated(rows)
             yield Block(rows, torch.as_tensor(self.X[rows]).to(x), x, tau)
 
     def _decoder(self, rows: slice) -> Decoder:
@@ -311,12 +300,18 @@ class Playback:
         stress = sources.stress_of(at, parameters, *law, self._precision, device)
         return Decoder(at, stress, sources.affine_of(at, parameters))
 
+    def _evaluated(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
+        """x and τ of some of the points, by the fields."""
+        with torch.no_grad():
+            decoder = self._decoder(rows)
+            x = decoder.position(self._xhat).cpu()
+            return x, decoder.stress(self._xhat, self._shat)[..., TAU_ROWS, TAU_COLUMNS].cpu()
+
     def _read(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
-        """x and τ of some of the points, in the frames of the full-order solver."""
-        with Trajectory.open(self.run.file(self._rest)) as rest:
-            of = {"frames": self._later, "particles": self._rows[rows]}
-            fields = (rest.read(name, **of) for name in ("x", "tau"))
-            return tuple(torch.as_tensor(values) for values in fields)
+        """x and τ of some of the points, of the full-order run."""
+        with Trajectory.open(self._full_order) as trajectory:
+            of = {"frames": self._frames, "particles": self._rows[rows]}
+            return tuple(torch.as_tensor(trajectory.read(name, **of)) for name in ("x", "tau"))
 
     @cached_property
     def _scene(self) -> Scene:
@@ -324,12 +319,11 @@ class Playback:
         return self._pipeline.deployed.at(self.case)
 
 
-def _rates(rollout: Rollout, frames: int) -> np.ndarray:
-    """[n, r] dx̂/dt [1/s] of the first frames; 0 of a run that was handed over before its first step."""
-    xhat = rollout.xhat[:frames]
-    if len(xhat) < 2:
-        return np.zeros_like(xhat)
-    changes = np.diff(xhat, axis=0)
+def _rates(rollout: Rollout) -> np.ndarray:
+    """[N + 1, r] dx̂/dt [1/s] of all steps; 0 of a run without steps."""
+    if len(rollout.xhat) < 2:
+        return np.zeros_like(rollout.xhat)
+    changes = np.diff(rollout.xhat, axis=0)
     return np.concatenate([changes[:1], changes]) / (rollout.t[1] - rollout.t[0])
 
 
