@@ -4,14 +4,20 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from joblib.externals.loky import ProcessPoolExecutor, cpu_count
 
+from nsf.memory import host_memory
+
 _POLL = 0.05  # [s] between looks at how far the others have come
+_STEPS = "steps"  # file of these
+#: Steps of particles, some seconds of them, from which on other processes are worth their start.
+_WORTH = 1_000_000
 
 Advance = Callable[[int], object]
 """Counts steps done; ends the work of a process that should stop."""
@@ -28,51 +34,84 @@ def cores(device: str) -> int:
     return min(cpu_count(), int(threads)) if threads.isdigit() and int(threads) else cpu_count()
 
 
-@contextlib.contextmanager
-def beside(work: Callable[[int, Advance], object], count: int, advance: Advance) -> Iterator[Callable]:
-    """Let other processes work while the block does; each has one thread.
-
-    Results do not depend on how many there are if the work of each shares out runs, and not parts of them.
+def helpers(device: str, scenes: Sequence, nbytes: int) -> int:
+    """Processes beside this one that are worth their start, one for each further core at most.
 
     Args:
-        work: of a process, by its number and with what counts its steps; importable, as are its arguments.
+        device: of the runs.
+        scenes: of each run.
+        nbytes: [byte] that a run takes.
+    """
+    work = sum(scene.steps * scene.particle_count for scene in scenes)
+    if work <= _WORTH:
+        return 0
+    return max(1, min(cores(device), len(scenes), host_memory() // max(1, nbytes))) - 1
+
+
+class Others:
+    """The processes beside this one; without any, this one does all.
+
+    Args:
+        folder: that all map their steps in, and claim runs in.
+        futures: of their work.
+        advance: counts their steps here.
+    """
+
+    def __init__(self, folder: Path, futures: Sequence[Future], advance: Advance):
+        self.folder, self._futures, self._advance, self._counted = folder, futures, advance, 0
+
+    def look(self) -> None:
+        """Count their steps up to now."""
+        if self._futures and (done := int(_steps_in(self.folder)[:-1].sum())) > self._counted:
+            self._advance(done - self._counted)
+            self._counted = done
+
+    def results(self) -> list:
+        """The result of each, once all have ended.
+
+        Raises:
+            Exception: the first one that ended the work of a process.
+        """
+        while not all(future.done() for future in self._futures):
+            time.sleep(_POLL)
+            self.look()
+        self.look()
+        return [future.result() for future in self._futures]
+
+
+@contextlib.contextmanager
+def beside(work: Callable[[int, Advance, Path], object], count: int, advance: Advance) -> Iterator[Others]:
+    """Let other processes work while the block does; each has one thread.
+
+    Results do not depend on how many there are if they share out runs, and not parts of them.
+
+    Args:
+        work: of a process, by its number, what counts its steps and the folder of `claim`; importable.
         count: of the processes; 0 for none.
         advance: counts their steps here.
-
-    Yields:
-        A call that counts the steps of the others up to now; with `wait=True` it waits for their end, and
-        gives the result of each.
-
-    Raises:
-        Exception: the first one that ended the work of a process, where it is waited for.
     """
-    if not count:
-        yield lambda wait=False: []
-        return
-    with TemporaryDirectory(prefix="nsf-") as folder:
-        path, counted = Path(folder) / "steps", 0
-        np.zeros(count + 1, np.int64).tofile(path)  # the last one tells all to stop
-        steps = np.memmap(path, np.int64, "r+")
+    with TemporaryDirectory(prefix="nsf-") as name:
+        folder = Path(name)
+        if not count:
+            yield Others(folder, (), advance)
+            return
+        np.zeros(count + 1, np.int64).tofile(folder / _STEPS)  # the last one tells all to stop
         pool = ProcessPoolExecutor(count, initializer=_begin, env={"OMP_NUM_THREADS": "1"})
-        futures = [pool.submit(_work, work, number, path) for number in range(count)]
-
-        def look(wait: bool = False) -> list:
-            nonlocal counted
-            while True:
-                ended = all(future.done() for future in futures)
-                done = int(steps[:-1].sum())
-                if done > counted:
-                    advance(done - counted)
-                    counted = done
-                if ended or not wait:
-                    return [future.result() for future in futures] if wait else []
-                time.sleep(_POLL)
-
         try:
-            yield look
+            futures = [pool.submit(_work, work, number, folder) for number in range(count)]
+            yield Others(folder, futures, advance)
         finally:
-            steps[-1] = 1
+            _steps_in(folder)[-1] = 1
             pool.shutdown()
+
+
+def claimed(folder: Path, run: int) -> bool:
+    """Whether a run, by its number, is for this process: it is the first of those beside it to ask."""
+    try:
+        (folder / f"{run}").touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
 
 
 def _begin() -> None:
@@ -80,12 +119,16 @@ def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _work(work: Callable[[int, Advance], object], number: int, path: Path) -> object:
-    steps = np.memmap(path, np.int64, "r+")
+def _work(work: Callable[[int, Advance, Path], object], number: int, folder: Path) -> object:
+    steps = _steps_in(folder)
 
     def advance(amount: int = 1) -> None:
         steps[number] += amount
         if steps[-1]:
             raise KeyboardInterrupt
 
-    return work(number, advance)
+    return work(number, advance, folder)
+
+
+def _steps_in(folder: Path) -> np.memmap:
+    return np.memmap(folder / _STEPS, np.int64, "r+")

@@ -56,6 +56,16 @@ def check_memory(scene, precision: str, device: str, stored: Precision | None = 
     require_memory(what, _PLACED * particles + solver + _WAITING * block, host_memory(), _SMALLER)
 
 
+def host_bytes(scene, precision: str, stored: Precision | None = None) -> int:
+    """[byte] that a full-order simulation takes on a CPU; arguments as of `check_memory`."""
+    from nsf.mpm.recording import block_bytes
+    from nsf.mpm.solver import bytes_on_device
+
+    solver = bytes_on_device(scene.particle_count, scene.grid, scene.material, precision_of(precision))
+    block = block_bytes(scene.particle_count, stored) if stored else 0
+    return _PLACED * scene.particle_count + solver + _WAITING * block
+
+
 def check_physics(scene) -> None:
     """Refuse a scene at t = 0 that cannot be meant.
 

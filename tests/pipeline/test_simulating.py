@@ -49,8 +49,7 @@ def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeyp
 def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_path, monkeypatch):
     """Bit for bit, and the bar ends at its total."""
     counted = []
-    monkeypatch.setattr(simulation, "cores", lambda device: 2)
-    monkeypatch.setattr(simulation, "_WORTH", 0)
+    monkeypatch.setattr(simulation, "helpers", lambda *of: 1)
     monkeypatch.setattr(Progress, "advance", lambda self, count=1: counted.append(count))
     pipeline = pipeline_at(tmp_path)
     for run in pipeline.simulate():
@@ -61,18 +60,18 @@ def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_
     assert sum(counted) == len(pipeline.runs_of("simulate")) * (pipeline.scene.steps + 1)
 
 
-def count(number, advance):
+def count(number, advance, folder):
     """The work of a process in the tests below."""
     for _ in range(3):
         advance(1)
-    return number, os.getpid()
+    return number, os.getpid(), cores.claimed(folder, 0)
 
 
-def fail(number, advance):
+def fail(number, advance, folder):
     raise InstabilityError("it burst")
 
 
-def go_on(number, advance):
+def go_on(number, advance, folder):
     while True:
         advance(1)
 
@@ -80,14 +79,16 @@ def go_on(number, advance):
 def test_processes_beside_this_one_count_here():
     steps = []
     with cores.beside(count, 1, steps.append) as others:
-        ((number, process),) = others(wait=True)
-    assert (number, sum(steps)) == (0, 3)
+        assert cores.claimed(others.folder, 1)
+        ((number, process, claimed),) = others.results()
+        assert not cores.claimed(others.folder, 0)
+    assert (number, claimed, sum(steps)) == (0, True, 3)
     assert process != os.getpid()
 
 
 def test_an_error_of_another_process_is_one_here():
     with pytest.raises(InstabilityError, match="it burst"), cores.beside(fail, 1, print) as others:
-        others(wait=True)
+        others.results()
 
 
 def test_processes_end_where_this_one_fails():
@@ -101,3 +102,12 @@ def test_a_launcher_says_how_many_cores_there_are(monkeypatch):
     assert (cores.cores("cpu"), cores.cores("cuda:0")) == (3, 1)
     monkeypatch.delenv("OMP_NUM_THREADS")
     assert cores.cores("cpu") == 8
+
+
+def test_helpers_are_as_many_as_are_worth_it_and_fit(chain, monkeypatch):
+    monkeypatch.setattr(cores, "cores", lambda device: 8)
+    monkeypatch.setattr(cores, "host_memory", lambda: 2**30)
+    few, many = [chain.scene] * 4, [chain.scene] * 400
+    assert [cores.helpers("cpu", runs, 2**20) for runs in (few, many)] == [0, 7]
+    assert cores.helpers("cpu", many, 2**28) == 3  # four at once
+    assert cores.helpers("cpu", many, 2**31) == 0

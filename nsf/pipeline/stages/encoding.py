@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from nsf.errors import InstabilityError
 from nsf.kinematics.manifold import Manifold
 from nsf.models.inputs import Lessons
 from nsf.models.lookup import inputs_in
-from nsf.pipeline.cores import Advance, beside, cores
+from nsf.pipeline.cores import Advance, beside, claimed, helpers
 from nsf.progress import Progress
 from nsf.recurrence.stream import (
     Encoded,
@@ -31,11 +32,10 @@ from nsf.recurrence.stream import (
 )
 from nsf.runs import Record, Run
 from nsf.scenes import Scene
+from nsf.scenes.checks import host_bytes
 from nsf.storage import intact
 
 _MANIFOLD = "manifold.pt"
-#: Runs of a process, at least: it takes seconds to start.
-_LEAST_RUNS = 8
 
 
 class Lesson(NamedTuple):
@@ -168,28 +168,35 @@ def _encoded(pipeline, encoder: Encoder, lessons: Sequence[Lesson], record: Reco
 
 def _stream(pipeline, encoder: Encoder, missing, after: Callable[[int], object]) -> list[str]:
     """Make runs and write each one's file, side by side where there are cores; why some are lost."""
-    how = pipeline.config.precision, pipeline.device
-    processes = max(1, min(cores(pipeline.device), len(missing) // _LEAST_RUNS))
-    trained = pipeline.training.file(_MANIFOLD)
-    parts = [missing[k::processes] for k in range(processes)]
-    help_with = partial(_help, trained, encoder.stress, how, parts)
-    with beside(help_with, processes - 1, after) as others:
+    how, device = (pipeline.config.precision, pipeline.device), pipeline.device
+    share = partial(_share, missing, how)
+    help_with = partial(_help, share, pipeline.training.file(_MANIFOLD), encoder.stress)
+    size = host_bytes(pipeline.scene, pipeline.config.precision)
+    count = helpers(device, [lesson.scene for lesson, _ in missing], size)
+    with beside(help_with, count, after) as others:
 
-        def advance() -> None:
-            after(1)
-            others()
+        def advance(steps: int) -> None:
+            after(steps)
+            others.look()
 
-        ends = [_run(encoder, how, *pair, advance) for pair in parts[0]]
-        ends += [end for part in others(wait=True) for end in part]
+        ends = [*share(encoder, advance, others.folder), *chain.from_iterable(others.results())]
     return [end for end in ends if end]
 
 
 def _help(
-    trained: Path, stress: int, how: tuple[str, str], parts, number: int, advance: Advance
+    share: Callable, trained: Path, stress: int, number: int, advance: Advance, folder: Path
 ) -> list[str]:
-    """Make another process's part of the runs; why some are lost, empty texts for others."""
-    encoder = Encoder(Manifold.load(trained), stress)
-    return [_run(encoder, how, *pair, lambda: advance(1)) for pair in parts[number + 1]]
+    """Share the runs in another process."""
+    return share(Encoder(Manifold.load(trained), stress), advance, folder)
+
+
+def _share(missing, how: tuple[str, str], encoder: Encoder, advance: Advance, folder: Path) -> list[str]:
+    """Make the runs that no other process makes; why some are lost, empty texts for others."""
+    return [
+        _run(encoder, how, *pair, lambda: advance(1))
+        for index, pair in enumerate(missing)
+        if claimed(folder, index)
+    ]
 
 
 def _run(encoder: Encoder, how: tuple[str, str], lesson: Lesson, path: Path, after=lambda: None) -> str:

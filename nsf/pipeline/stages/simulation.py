@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -19,17 +20,16 @@ from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
 from nsf.pipeline.checks import check_room
-from nsf.pipeline.cores import Advance, beside, cores
+from nsf.pipeline.cores import Advance, beside, helpers
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.scenes import Scene
+from nsf.scenes.checks import host_bytes
 from nsf.scenes.resolution import resolution_warnings
 
 # Trajectories that are written at once; each holds about ten blocks of frames (64 MiB) at most.
 _WRITERS = min(8, os.cpu_count() or 1)
 _BLOCKS = 8
-#: Steps of particles, some seconds of them, from which on other processes are worth their start.
-_WORTH = 1_000_000
 
 
 @dataclass
@@ -119,11 +119,11 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
 
         def advance(count: int = 1) -> None:
             progress.advance(count)
-            others()
+            others.look()
 
         writing, left = _share(jobs, shared, pool, HostMemory(), advance, say, progress.describe)
         made = len(writing)
-        for count, lines in others(wait=True):
+        for count, lines in others.results():
             made += count
             for line in lines:
                 say(line)
@@ -135,7 +135,9 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
     return made
 
 
-def _help(jobs: Sequence[Job], shared: Shared, number: int, advance: Advance) -> tuple[int, list[str]]:
+def _help(
+    jobs: Sequence[Job], shared: Shared, number: int, advance: Advance, folder: Path
+) -> tuple[int, list[str]]:
     """Make what no other process makes, each helper from elsewhere on; how many, and lines for the user."""
     begin, lines = (number + 1) * len(jobs) // (shared.helpers + 1), []
     with ThreadPoolExecutor(_WRITERS) as pool:
@@ -297,8 +299,7 @@ def make(
         return Job(run, case, build, forcing, warnings.get(run, ()))
 
     jobs = [job(run, *needed) for run, needed in runs.items()]
-    work = sum(scene.steps * scene.particle_count for _, scene in runs.values())
-    helpers = min(cores(device), len(jobs)) - 1 if work > _WORTH else 0
-    steps, dx = pipeline.scene.steps, pipeline.scene.dx
-    shared = Shared(steps, every, dx, pipeline.stored, device, c.precision, helpers)
+    scenes, steps, dx = [scene for _, scene in runs.values()], pipeline.scene.steps, pipeline.scene.dx
+    count = helpers(device, scenes, host_bytes(pipeline.scene, c.precision, pipeline.stored))
+    shared = Shared(steps, every, dx, pipeline.stored, device, c.precision, count)
     return simulate(jobs, shared, pipeline.say)

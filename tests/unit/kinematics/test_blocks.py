@@ -48,3 +48,13 @@ def test_coordinates_are_those_of_one_product(n):
     generator = torch.Generator().manual_seed(0)
     values, modes = (torch.randn(*shape, generator=generator).double() for shape in ((7, n), (n, 5)))
     torch.testing.assert_close(blocks.coordinates(values, modes), values @ modes)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("tolerance", [0.0, 1e-2])
+def test_tensor_cores_are_near_enough_on_a_gpu(manifold, tolerance):
+    xhat = manifold.training_latents
+    exact = manifold.restrict().position(xhat)
+    at = manifold.restrict(dtype=torch.float32, device="cuda")
+    x = torch.cat([block.double().cpu() for block in at.positions(xhat.float().cuda(), tolerance)])
+    assert (x - exact).norm() < (tolerance or 1e-5) * (exact - manifold.X).norm()
