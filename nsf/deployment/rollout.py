@@ -65,7 +65,7 @@ class Rollout:
 
     @property
     def handed_over(self) -> int:
-        """Step from whose state the full-order solver goes on, which is the first; −1 where it does not."""
+        """0 where the full-order solver took the run; −1 where it did not."""
         return 0 if self.by == FULL_ORDER else -1
 
     def save(self, path: Path) -> None:
@@ -157,5 +157,5 @@ def rollout_file(index: int) -> str:
 
 
 def continuation_file(index: int) -> str:
-    """File of a deploy run in which the full-order solver goes on with that reduced run."""
+    """File of a deploy run with the frames of that run where the full-order solver took it."""
     return f"continuation_{index}.h5"

@@ -11,7 +11,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.data.schema import COMPONENTS
-from nsf.deployment import Rollout
+from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
@@ -35,7 +35,7 @@ class Comparison:
     Attributes:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
             `stress_error` is also ∞ where the run's stress is not finite in some frame.
-            Of a run that was handed over, the frames of its continuation count like the reduced ones.
+            Of a run that the full-order solver took, its frames count like reduced ones.
         distance: from the full-order run, RMS over particles and frames 1..N [m]; distance_max: largest of a
             frame, RMS over particles [m]; ∞ likewise.
         quantities: by name, a scalar of the shape at the end less the full-order run's [m]; ∞ likewise.
@@ -69,16 +69,12 @@ def _between(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def bound_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
     """Error bound [F] [m] at the full-order frame times: that of the first step which has reached them.
 
-    NaN after a hand-over, where there is no error.
+    NaN of a run by the full-order solver.
     """
+    if rollout.by == FULL_ORDER:
+        return np.full(len(t), np.nan)
     reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
-    return np.where(_of_continuation(rollout, t), np.nan, rollout.verdict.bound[reached])
-
-
-def _of_continuation(rollout: Rollout, t: np.ndarray) -> np.ndarray:
-    """[F] whether the frames at times t come after the hand-over."""
-    n = rollout.handed_over
-    return t > rollout.t[n] + _SAME_TIME if n >= 0 else np.zeros(len(t), bool)
+    return rollout.verdict.bound[reached]
 
 
 def compare(
@@ -87,7 +83,7 @@ def compare(
     rollout: Rollout,
     split: str,
     pictures: tuple[int, int],
-    continuation: Trajectory | None = None,
+    taken: Trajectory | None = None,
     advance: Callable[[int], object] = lambda frames: None,
 ) -> Comparison:
     """Errors of a rollout against the trajectory of the same case.
@@ -100,11 +96,11 @@ def compare(
         rollout: the reduced run.
         split: `test`, `validation` or `train`.
         pictures: numbers of particles and of frames kept for pictures.
-        continuation: the full-order frames of a rollout that was handed over, from the hand-over on.
+        taken: the frames of a rollout that the full-order solver took.
         advance: told how many frames more are compared.
 
     Raises:
-        SchemaError: the trajectory is of other particles, or a continuation is missing or too short.
+        SchemaError: the trajectory is of other particles, or the frames of the full-order solver are missing.
         InstabilityError: an error is not finite, though the run did not diverge.
     """
     scene, manifold, setup = solver.scene, solver.manifold, solver.setup
@@ -120,11 +116,10 @@ def compare(
     last = rollout.t[rollout.diverged - 1] if diverged else np.inf
     good = trajectory.t <= last + _SAME_TIME
     xhat[~good] = xhat[good][-1]  # pictures of a diverged run hold its last state; its errors are ∞
-    until = int((~_of_continuation(rollout, trajectory.t)).sum())  # frames up to the hand-over
-    if until < frames and (continuation is None or continuation.frames != frames - until + 1):
+    if rollout.by == FULL_ORDER and (taken is None or taken.frames != frames):
         raise SchemaError(
-            f"the run at {rollout.case.named} was handed over at frame {until - 1} of {frames - 1}, and its "
-            "full-order continuation does not reach the end; deploy again"
+            f"the full-order solver took the run at {rollout.case.named}, and its {frames} frames are not "
+            "there; deploy again"
         )
 
     def tensor(values) -> torch.Tensor:
@@ -137,7 +132,7 @@ def compare(
     rate = (xhat - before) / trajectory.dt
     rate[0] = solver.first_rate
     stress = None if rollout.stress is None else tensor(_between(trajectory.t, rollout.t, rollout.stress))
-    latents = _Latents(xhat[:until], before[:until], rate[:until], stress, trajectory.dt)
+    latents = _Latents(xhat, before, rate, stress, trajectory.dt)
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
     shown_frames = spaced(frames, pictures[1])
     samples = {n: _sample_at(solver, trajectory.t[n]) for n in shown_frames}
@@ -155,7 +150,9 @@ def compare(
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        x_rom, v_rom, C_rom, tau_rom = _reduced_fields(decoder, latents, continuation, block, carried)
+        x_rom, v_rom, C_rom, tau_rom = (
+            _read(taken, block, x) if taken else _reduced_fields(decoder, latents.rows(block), carried)
+        )
         if start == 0:
             v_rom[0] = v[0]
         encoded = manifold.encode(x).to(setup.dtype)
@@ -218,7 +215,8 @@ def compare(
     metrics.require_finite(errors, rollout.case.named)
     ends = [at_end(column[f"height_{of}"], shape[-1], X) for of, shape in (("rom", x_rom), ("fom", x))]
     off = {name: np.inf if diverged else ends[0][name] - ends[1][name] for name in QUANTITIES}
-    xhat[until:] = torch.nan  # full-order frames are no latent vectors
+    if taken:
+        xhat[:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
         **dict.fromkeys((*reduced, "distance", "distance_max"), np.inf) | errors,
         quantities=off,
@@ -282,10 +280,10 @@ def _series(
 
 
 class _Latents(NamedTuple):
-    """Latent vectors at the frames up to a hand-over.
+    """Latent vectors at frames.
 
     Attributes:
-        xhat: [until, r]; before: [until, r] x̂ a step before; rate: [until, r] dx̂/dt [1/s].
+        xhat: [F, r]; before: [F, r] x̂ a step before; rate: [F, r] dx̂/dt [1/s].
         stress: [F, n_s] ŝ of a run that has them.
         dt: step [s].
     """
@@ -296,51 +294,44 @@ class _Latents(NamedTuple):
     stress: torch.Tensor | None
     dt: float
 
-    def rows(self, start: int, stop: int) -> "_Latents":
+    def rows(self, frames: slice) -> "_Latents":
         """Those of some frames."""
-        xhat, before, rate = (values[start:stop] for values in self[:3])
-        stress = None if self.stress is None else self.stress[start : start + len(xhat)]
-        return _Latents(xhat, before, rate, stress, self.dt)
+        return _Latents(*(None if values is None else values[frames] for values in self[:4]), self.dt)
 
 
-def _reduced_fields(
-    decoder: Decoder,
-    latents: _Latents,
-    continuation: Trajectory | None,
-    frames: slice,
-    carried: "_Carried | None",
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """x [F, P, 3] [m], v [F, P, 3] [m/s], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames of a run.
+#: x [F, P, 3] [m], v [F, P, 3] [m/s], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames.
+_Fields = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+def _read(trajectory: Trajectory, frames: slice, like: torch.Tensor) -> _Fields:
+    """Fields of some frames of a full-order run."""
+    read = (torch.as_tensor(trajectory.read(name, frames=frames)) for name in COMPONENTS)
+    x, v, C, tau = (values.to(like) for values in read)
+    return x, v, C.unflatten(2, (3, 3)), tau
+
+
+def _reduced_fields(decoder: Decoder, now: _Latents, carried: "_Carried | None") -> _Fields:
+    """Fields of some frames of a reduced run.
 
     v is the backward difference of a step, as the particles of a full-order run have it.
 
     Args:
         decoder: the fields at every particle.
-        latents: of the frames up to the hand-over; the later frames are read.
-        continuation: full-order frames, of which the first is the last of `latents`.
-        frames: which, of the whole run; those before them were read already.
+        now: latents of the frames; those before them were decoded already.
         carried: gives τ and C in place of the fields.
     """
-    until, parts, now = len(latents.xhat), [], latents.rows(frames.start, frames.stop)
-    if len(now.xhat):
-        if carried is None:
-            C, tau = decoder.affine(now.xhat, now.rate), decoder.stress(now.xhat, now.stress)
-        else:
-            C, tau = carried.next(len(now.xhat))
-        x = decoder.position(now.xhat)
-        v = (x - decoder.position(now.before)) / now.dt
-        parts.append((x, v, C, tau[..., _UPPER[0], _UPPER[1]]))
-    if frames.stop > until:
-        since = slice(max(frames.start, until) - until + 1, frames.stop - until + 1)
-        read = (torch.as_tensor(continuation.read(name, frames=since)) for name in COMPONENTS)
-        x, v, C, tau = (values.to(latents.xhat) for values in read)
-        parts.append((x, v, C.unflatten(2, (3, 3)), tau))
-    return tuple(torch.cat(fields) for fields in zip(*parts, strict=True))
+    if carried is None:
+        C, tau = decoder.affine(now.xhat, now.rate), decoder.stress(now.xhat, now.stress)
+    else:
+        C, tau = carried.next(len(now.xhat))
+    x = decoder.position(now.xhat)
+    v = (x - decoder.position(now.before)) / now.dt
+    return x, v, C, tau[..., _UPPER[0], _UPPER[1]]
 
 
 def _carries(solver: ReducedMPM, rollout: Rollout, trajectory: Trajectory) -> bool:
     """Whether the solver takes the steps of the rollout itself, and its particles carry their stress."""
-    whole = not solver.span.latent_only and rollout.handed_over < 0 and rollout.diverged < 0
+    whole = not solver.span.latent_only and rollout.by != FULL_ORDER and rollout.diverged < 0
     return solver.setup.sources.carried and whole and solver.dt == trajectory.dt
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nsf.data import Trajectory
-from nsf.deployment import Rollout
+from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics.interop import as_tensor, torch_device, torch_dtype
 from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation import metrics
@@ -111,7 +111,7 @@ def superresolve(
         say: told of each fine run.
 
     Raises:
-        ConfigError: a rollout was handed over to the full-order solver, so its fields end before the scene.
+        ConfigError: the full-order solver took a rollout, which has no fields.
         InstabilityError: a fine run is unstable where the coarse one is not, as more particles meet
             more extreme strains; names the remedy. Or an error is not finite.
     """
@@ -163,12 +163,11 @@ def superresolve(
 
 
 def _check_own(rollout: Rollout) -> None:
-    """Refuse a rollout whose last frames are the full-order solver's."""
-    if rollout.handed_over >= 0:
+    """Refuse a rollout whose frames are the full-order solver's."""
+    if rollout.by == FULL_ORDER:
         raise ConfigError(
-            f"the reduced run at {rollout.case.named} was handed over to the full-order solver at "
-            f"t = {rollout.t[rollout.handed_over]:.4g} s and has no fields beyond; "
-            "deploy with fallback=none"
+            f"the full-order solver took the run at {rollout.case.named}, which has no fields; deploy with "
+            "fallback=none"
         )
 
 

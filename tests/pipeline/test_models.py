@@ -51,7 +51,7 @@ def test_beyond_its_training_an_interpolated_run_may_be_projected(copied, pipeli
     assert (kept.by, kept.verdict.flag, "latent" in kept.stops) == ("projected", "red", False)
     assert any("goes to projected, since interpolate is red: friction_angle=60 is outside" in s for s in said)
     handed, rows, _ = run_of(pipeline_at, root, *keys, "fallback=full")
-    assert Rollout.open(handed.deployment.file("rollout_0.h5")).handed_over == 0
+    assert Rollout.open(handed.deployment.file("rollout_0.h5")).by == "full"
     assert rows["delta"][0] < 1e-6
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import PROJECTED, TRUST, Rollout, Trust, continuation_file, rollout_file
+from nsf.deployment import FULL_ORDER, PROJECTED, TRUST, Rollout, Trust, continuation_file, rollout_file
 from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import (
     Comparison,
@@ -138,7 +138,7 @@ def _compare(
     with contextlib.ExitStack() as files:
         trajectory = files.enter_context(Trajectory.open(truth))
         rest = None
-        if rollout.handed_over >= 0:
+        if rollout.by == FULL_ORDER:
             rest = files.enter_context(Trajectory.open(pipeline.deployment.file(continuation_file(index))))
         solver = pipeline.solver_at(manifold, rollout.case, engine=_took(pipeline, rollout))
         shown = (keys.picture_particles, keys.picture_frames)

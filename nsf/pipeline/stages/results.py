@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nsf.data import Case
-from nsf.deployment import PROJECTED, Rollout, Verdict
+from nsf.deployment import FULL_ORDER, PROJECTED, Rollout, Verdict
 from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.evaluation.surroundings import surroundings
@@ -97,8 +97,8 @@ def rows(
         as_run = _cost_by(cost, rollout.by)
         times = _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None))
         times |= {"break_even_runs": _break_even(as_run, sum(offline))}
-        if rollout.diverged >= 0 or rollout.handed_over >= 0:
-            # A step whose particles have left the grid costs no one's speedup, nor does half a run.
+        if rollout.diverged >= 0 or rollout.by == FULL_ORDER:
+            # A step whose particles have left the grid costs no one's speedup, nor does a full-order run.
             times |= dict.fromkeys(_OF_WHOLE_RUNS, math.nan)
         numbers = list(rollout.case.values())
         of_case = {

@@ -333,7 +333,7 @@ def test_a_run_by_the_full_order_solver_has_its_frames(
 
 def test_such_frames_must_be_there(taken, chain, tiny_manifold, truth):
     solver = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu")
-    with pytest.raises(SchemaError, match=r"handed over at frame 0 of 24"):
+    with pytest.raises(SchemaError, match=r"took the run at .*, and its 25 frames are not there"):
         compare(solver, truth, taken, "test", (10, 2), None)
 
 

@@ -112,8 +112,7 @@ def test_a_diverged_run_has_no_finite_error(chain, tiny_manifold, truth, made):
     assert np.isfinite(found.row["interpolation_error"])
 
 
-def test_a_run_that_was_handed_over_is_refused(chain, tiny_manifold, truth, made):
-    """Its fields end at the hand-over; the frames after it are not theirs."""
+def test_a_run_by_the_full_order_solver_is_refused(chain, tiny_manifold, truth, made):
     handed = replace(made, by="full")
-    with pytest.raises(ConfigError, match=r"handed over .* deploy with fallback=none"):
+    with pytest.raises(ConfigError, match=r"took the run at .* deploy with fallback=none"):
         superresolve(tiny_manifold, chain.scene, [truth, truth], [made, handed], 2, FRAMES, device="cpu")
