@@ -95,10 +95,12 @@ class PlainReport:
 
 @dataclass(frozen=True)
 class BriefReport:
-    """Of each variant the two pictures that a page of many has: the others are drawn by the same code."""
+    """Two charts, and of each variant the one picture that a page of many has: the others are drawn alike."""
 
     def __call__(self):
         importlib.import_module("nsf.results.pictures")._MANY = 0
+        report = importlib.import_module("nsf.results.report")
+        report.CHARTS = {name: report.CHARTS[name] for name in ("delta", "latent")}
 
 
 def _at(where, call, act):
