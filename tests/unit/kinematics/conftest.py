@@ -13,7 +13,7 @@ FIELDS = {
     "basis": BasisField(modes=[9, 7, 8], beta=4, depth=2),
     "mlp": MlpField(beta=4, head_parameters=True),
 }
-QUICK = FastTrainer(steps=250, learning_rate=1e-2, frames_per_batch=6, particles_per_batch=40)
+QUICK = FastTrainer(steps=150, learning_rate=1e-2, frames_per_batch=6, particles_per_batch=40)
 PARTICLES, FRAMES, LATENT = 150, 13, 2
 
 
