@@ -83,27 +83,30 @@ def _at(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Reach:
     """What was taught: parameters, forcing, and latent states of training runs, and of drawn ones."""
-    scene, model = pipeline.scene, pipeline.model
+    scene = pipeline.scene
     parameters = manifold.training_parameters.double().cpu().numpy()
     latents = manifold.training_latents.double().cpu().numpy()
-    radius, solids = 0.0, None
-    if scene.forcing.colliders:
-        runs = [scene.at(case).solids for case in pipeline.split.train]
-        solids = np.stack([collider_states(run, scene.dt, scene.steps) for run in runs])
-    if isinstance(model, Drawn):
-        radius = model.gravity * float(np.linalg.norm(scene.gravity))
-        if pipeline.encoding.complete:
-            lessons = encoded_runs(pipeline, manifold)
-            latents = np.concatenate([latents, lessons.xhat.reshape(-1, latents.shape[1])])
-            solids = solids if solids is None else lessons.inputs.solids
-    if scene.forcing.gravity:
-        radius = scene.forcing.reach(scene.base_gravity)
+    runs, t = [scene.at(case) for case in pipeline.split.train], scene.dt * np.arange(scene.steps)
+    if scene.forcing.gravity:  # what programs may add, rather than what those of training did
+        acting, reach = (
+            np.array([[run.base_gravity] for run in runs]),
+            scene.forcing.reach(scene.base_gravity),
+        )
+    else:
+        acting, reach = np.stack([run.acting_gravity.at(t) for run in runs]), 0.0
+    solids = np.stack([collider_states(run.solids, scene.dt, scene.steps) for run in runs])
+    if isinstance(pipeline.model, Drawn) and pipeline.encoding.complete:
+        lessons = encoded_runs(pipeline, manifold)
+        latents = np.concatenate([latents, lessons.xhat.reshape(-1, latents.shape[1])])
+        acting = acting if scene.forcing.gravity else lessons.inputs.gravity
+        solids = lessons.inputs.solids
+    gravity = acting.mean((0, 1))
     return Reach(
         names=tuple(manifold.parameter_names),
         box=np.stack([parameters.min(0), parameters.max(0)], 1),
-        gravity=np.asarray(scene.base_gravity, float),
-        radius=radius,
-        solids=None if solids is None else Band.of_solids(solids, scene.dt),
+        gravity=gravity,
+        radius=reach + float(np.linalg.norm(acting - gravity, axis=-1).max()),
+        solids=Band.of_solids(solids, scene.dt) if scene.forcing.colliders else None,
         states=Band.of_states(latents @ trust.metric, [rollout.xhat @ trust.metric for rollout in rollouts]),
         changed=", ".join(pipeline.config.deploy.changes or ()),
     )
