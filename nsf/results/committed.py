@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 
 from nsf import schemas
 from nsf.errors import SchemaError
+from nsf.manifest import digest
 from nsf.results import report, table
 from nsf.results.charts import CHARTS, View
 from nsf.results.charts.cases import COLORS
@@ -30,7 +31,6 @@ from nsf.results.folder import MARK
 from nsf.results.formats import Rows, markdown_document
 from nsf.results.page import Picture, Section
 from nsf.results.question import Question
-from nsf.results.sources import file_hash
 from nsf.results.style import fingerprint, save
 from nsf.runs.provenance import not_ignored
 from nsf.schemas import Maybe
@@ -245,7 +245,7 @@ def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list
     for path, one in reports.pictures.items():
         if not (folder / path).is_file():
             differing.append(f"{folder / path} is missing; {_REBUILD}")
-        elif file_hash(folder / path) != one["sha256"]:
+        elif digest(folder / path) != one["sha256"]:
             differing.append(f"{folder / path} was changed; {_REBUILD}")
     if missing := set(reports.frame["run"]) - set(reports.runs):
         differing.append(f"{folder / PROVENANCE} has no origin of {sorted(missing)[0]}; {_REBUILD}")
@@ -280,7 +280,7 @@ def _drawn(reports: Reports) -> dict[str, str]:
 
 def _seal(data: str, file: Path) -> str:
     """sha256 of a figure's fingerprint and of the file that shows it; empty where there is no file."""
-    return hashlib.sha256(f"{data} {file_hash(file)}".encode()).hexdigest() if file.is_file() else ""
+    return hashlib.sha256(f"{data} {digest(file)}".encode()).hexdigest() if file.is_file() else ""
 
 
 def _write_pages(reports: Reports, name: str) -> None:
@@ -381,7 +381,7 @@ def _listed_section(mark: Path) -> dict:
 def _changed(folder: Path) -> list[str]:
     """Files of such a report that are not those whose hashes it holds."""
     recorded = _read(folder / MARK, _MARK).get("files", {})
-    present = {path.name: file_hash(path) for path in sorted(folder.iterdir()) if path.name != MARK}
+    present = {path.name: digest(path) for path in sorted(folder.iterdir()) if path.name != MARK}
     missing = {name for name in recorded.keys() - present.keys() if not name.endswith(_MADE_ANEW)}
     changed = {name for name in recorded.keys() & present.keys() if recorded[name] != present[name]}
     return [

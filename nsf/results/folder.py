@@ -4,11 +4,13 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from nsf.errors import ConfigError, StorageError
+from nsf.manifest import digest
 from nsf.storage import locked
 
 MARK = "sources.json"
@@ -105,6 +107,20 @@ def _no_place(folder: Path, error: OSError) -> StorageError:
         f"no report can be written to {folder}: {error.strerror}; make the folder above it writable, or "
         "set report.folder or NSF_REPORTS"
     )
+
+
+def record(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write `sources.json`: what a report says of itself, and the sha256 of each of its files."""
+    files = {path.name: digest(path) for path in sorted(folder.iterdir())}
+    text = json.dumps({**content, "files": files}, indent=1, ensure_ascii=False, default=plain)
+    (folder / MARK).write_text(f"{text}\n", encoding="utf-8", errors="backslashreplace")
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it."""
+    if hasattr(value, "item"):
+        return value.item()
+    return dict(value) if isinstance(value, Mapping) else list(value)
 
 
 @contextmanager

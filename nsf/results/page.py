@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from nsf.results.formats import HTML, Rows, markdown_document
 
@@ -44,6 +45,11 @@ class Page:
     sections: Sequence[Section]
     provenance: Table
     definitions: Sequence[tuple[str, str]] = ()
+
+    def write(self, folder: Path) -> None:
+        """Write `index.html` and `index.md`."""
+        (folder / "index.html").write_text(html_page(self), encoding="utf-8")
+        (folder / "index.md").write_text(markdown_page(self), encoding="utf-8")
 
 
 def html_page(page: Page) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 from nsf.errors import SchemaError
 from nsf.manifest import altered, digest
-from nsf.results.folder import MARK
+from nsf.results.folder import MARK, plain
 from nsf.runs.run import Run
 
 FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")
@@ -93,13 +93,6 @@ def made_of(runs: Iterable[Run], question: Question, first: Run | None = None) -
         "code": _code(),
     }
     return _sum(content)
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON has it."""
-    if hasattr(value, "item"):
-        return value.item()
-    return dict(value) if isinstance(value, Mapping) else list(value)
 
 
 @cache

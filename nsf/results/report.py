@@ -4,7 +4,6 @@ A report is a folder with `index.html`, `index.md`, `results.csv` (the table), `
 booktabs), charts and pictures, and `sources.json`: the origin of each run, and the sha256 of each file.
 """
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,11 +25,11 @@ from nsf.results.columns import (
     RIVALS,
     SEEDS,
 )
-from nsf.results.folder import MARK, replaced
+from nsf.results.folder import record, replaced
 from nsf.results.formats import Rows, latex_table, spreadsheet
-from nsf.results.page import Page, Picture, Section, Table, html_page, markdown_page
-from nsf.results.question import Question, made_of, plain
-from nsf.results.sources import KEPT, Source, checked_hash, file_hash, open_sources
+from nsf.results.page import Page, Picture, Section, Table
+from nsf.results.question import Question, made_of
+from nsf.results.sources import KEPT, Source, checked_hash, open_sources
 from nsf.results.style import save
 from nsf.runs import Run
 from nsf.runs.columns import differing
@@ -108,10 +107,8 @@ def build_report(
             "trained": view.trained,
             "logarithmic": sorted(view.logarithmic),
             "pictures": {p.files[-1]: {"caption": p.caption, "runs": list(p.runs)} for p in shown},
-            "files": {path.name: file_hash(path) for path in sorted(fresh.iterdir())},
         }
-        text = json.dumps(content, indent=1, ensure_ascii=False, default=plain) + "\n"
-        (fresh / MARK).write_text(text, encoding="utf-8", errors="backslashreplace")
+        record(fresh, content)
     return Path(folder) / "index.html"
 
 
@@ -265,8 +262,7 @@ def write_pages(
         provenance=Table("Where the numbers come from", provenance_rows(runs), _NOTE),
         definitions=definitions(used),
     )
-    (folder / "index.html").write_text(html_page(page), encoding="utf-8")
-    (folder / "index.md").write_text(markdown_page(page), encoding="utf-8")
+    page.write(folder)
     tex = latex_table(shown, question.title, first.note)
     (folder / "results.tex").write_text(tex, encoding="utf-8")
 

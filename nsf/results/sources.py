@@ -4,7 +4,6 @@
 and by method the figures that it prints.
 """
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -229,12 +228,6 @@ def checked_hash(run: Run, name: str) -> str:
             f"delete the run folder and run `nsf {run.stage}` again"
         )
     return recorded["sha256"]
-
-
-def file_hash(path: Path) -> str:
-    """sha256 of a file, in hex."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _whole(run: Run, stage: str) -> list[Run]:

@@ -11,7 +11,7 @@ from nsf.results.folder import MARK
 #: In the middle of the pictures, before the page, and between the two renames of the exchange.
 MOMENTS = {
     "drawing": ("nsf.results.report:save", 2),
-    "writing": ("nsf.results.report:markdown_page", 1),
+    "writing": ("nsf.results.page:markdown_page", 1),
     "exchanging": ("nsf.results.folder:Path.rename", 2),
 }
 

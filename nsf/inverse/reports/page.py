@@ -1,7 +1,6 @@
 """A folder of results of inverse problems: a page, tables, charts and sources, listed by `nsf reports`."""
 
 import itertools
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,11 +12,11 @@ from matplotlib.figure import Figure
 from nsf.data import PROGRAM
 from nsf.inverse.model import Forcing, Model
 from nsf.results.columns import axis, number
-from nsf.results.folder import MARK, replaced
+from nsf.results.folder import record, replaced
 from nsf.results.formats import Rows, spreadsheet
-from nsf.results.page import Page, Picture, Section, Table, html_page, markdown_page
+from nsf.results.page import Page, Picture, Section, Table
 from nsf.results.report import commit_text, provenance_rows
-from nsf.results.sources import KEPT, file_hash
+from nsf.results.sources import KEPT
 from nsf.results.style import save
 from nsf.runs import Run
 from nsf.runs.provenance import provenance
@@ -112,20 +111,17 @@ def write(results: Results, folder: Path) -> Path:
             tables=results.tables, sections=sections, definitions=results.definitions,
             provenance=Table("Sources", shown, _NOTE),
         )  # fmt: skip
-        (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
-        (fresh / "index.md").write_text(markdown_page(page), encoding="utf-8")
+        page.write(fresh)
         first = results.charts[0]
         content = {
             "title": results.title,
             "question": results.lead,
             "asked": dict(results.settings),
-            "files": {path.name: file_hash(path) for path in sorted(fresh.iterdir())},
             "runs": origins,
             "chart": {"file": f"{first.stem}.png", "caption": first.caption},
             "listed": _listed(results.tables[0], origins),
         }
-        text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-        (fresh / MARK).write_text(text, encoding="utf-8")
+        record(fresh, content)
     return Path(folder) / "index.html"
 
 
