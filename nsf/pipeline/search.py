@@ -108,7 +108,7 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
     if not table["pareto"].any():
         raise MissingRunError("no trial of this search has a result; the lines above say why")
     folder = Path(config.report.folder) / f"search_{study.study_name}"
-    return write_search(table, [r.key for r in ranges], objectives, folder)
+    return write_search(table, objectives, folder)
 
 
 def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:

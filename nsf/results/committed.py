@@ -290,7 +290,7 @@ def _write_pages(reports: Reports, name: str) -> None:
     runs = {run: reports.runs[run] for run in sorted(set(view.frame["run"])) if run in reports.runs}
     charts = report.draw(view, place, question.plots)
     sections = [Section("Charts", charts), Section("Pictures", reports.drawn(name))]
-    report.write_pages(reports.rows(name), question, place, sections, runs, view)
+    report.write_pages(question, place, sections, runs, view)
 
 
 def _page(reports: Reports) -> str:

@@ -97,7 +97,7 @@ def build_report(
         ]
         fine = _fine_tables(view.frame, question, fresh)
         runs_of = origins(sources) | _fine_origins(view.frame, question)
-        write_pages(frame, question, fresh, sections, runs_of, view, fine, _warnings(sources))
+        write_pages(question, fresh, sections, runs_of, view, fine, _warnings(sources))
         shown = [picture for section in sections for picture in section.pictures]
         content = {
             "name": question.name,
@@ -219,7 +219,6 @@ def draw(view: View, folder: Path, plots: Sequence[str] | None) -> list[Picture]
 
 
 def write_pages(
-    frame: pd.DataFrame,
     question: Question,
     folder: Path,
     sections: Sequence[Section],
@@ -231,7 +230,6 @@ def write_pages(
     """Write `index.html`, `index.md` and `results.tex` of a report.
 
     Args:
-        frame: its table.
         question, sections: what it is about, and its pictures.
         runs: the origin of each run, by id.
         view: of the table.

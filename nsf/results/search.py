@@ -18,12 +18,12 @@ from nsf.storage import writing
 OBJECTIVES: dict[str, Column] = {"delta": COLUMNS["delta"], "step_ms": COLUMNS["step_ms"]}
 
 
-def write_search(table: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str], folder: Path) -> Path:
+def write_search(table: pd.DataFrame, objectives: Sequence[str], folder: Path) -> Path:
     """Write `trials.csv` and the chart, `search.svg` and `search.png`; gives the chart.
 
     Args:
         table: one row a trial: `trial`, the keys, the objectives (NaN where it failed), `pareto`.
-        keys, objectives: columns of it; an objective is a key of `OBJECTIVES`.
+        objectives: columns of it, each a key of `OBJECTIVES`.
         folder: they go there.
 
     Raises:
