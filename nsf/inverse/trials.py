@@ -63,7 +63,7 @@ def run(model: Model, trials: Trials, say: Callable[[str], object] = print) -> t
     Args:
         model: of the runs.
         trials: how they are made.
-        say: told of each trial.
+        say: called with a line of each trial.
 
     Returns:
         One row a trial and parameter, with `COLUMNS`: `inside_90` is 1 where the 90 % interval holds the

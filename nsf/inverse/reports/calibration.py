@@ -57,7 +57,7 @@ def calibration(
         space: where to look.
         full_order: whether to make that run.
         starts: see `fit`.
-        say: told what is done.
+        say: called with a line of what is done.
 
     Returns:
         A page with `estimate.csv`, `correlation.csv` and `residuals.csv`.

@@ -41,7 +41,7 @@ def designing(
         program, view, parameters: as for `design`.
         run_full_order: whether to make that run.
         seed: of the programs to begin at.
-        say: told what is done.
+        say: called with a line of what is done.
 
     Returns:
         A page with `program.csv` and `targets.csv`.

@@ -54,7 +54,7 @@ def sampling(
         full_order: base of a design of full-order runs; 0 for none.
         view: of observations, for a posterior.
         seed: of everything that is drawn.
-        say: told what is done.
+        say: called with a line of what is done.
 
     Returns:
         A page with `quantiles.csv`, `runs.csv.gz`, `sensitivities.csv` and `posterior.csv`.

@@ -32,7 +32,7 @@ def trying(models: Sequence[Model], trials: Trials, say: Callable[[str], object]
     Args:
         models: of different scenes.
         trials: how they are made.
-        say: told of each trial.
+        say: called with a line of each trial.
 
     Returns:
         A page with `results.csv`.
