@@ -50,7 +50,7 @@ def _means(frame: pd.DataFrame, report: str, model: str) -> pd.DataFrame:
     rows = table.labelled(table.query(frame, report=report, model=model))
     if "model.runs" in rows:
         rows = rows[rows["model.runs"] == rows["model.runs"].max()]
-    return table.means(rows).set_index("body")
+    return table.means(rows, ("body",)).set_index("body")
 
 
 def updated(text: str, frame: pd.DataFrame) -> str:
