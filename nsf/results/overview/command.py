@@ -98,7 +98,7 @@ def _csv(rows: Sequence[Mapping[str, Any]]) -> None:
     from nsf.results.formats import spreadsheet  # templates take 0.1 s
 
     names = dict.fromkeys(name for row in rows for name in row)
-    writer = csv.DictWriter(sys.stdout, list(names), lineterminator="\n")
+    writer = csv.DictWriter(sys.stdout, list(names) or [*FIELDS[:-1], "path"], lineterminator="\n")
     writer.writeheader()
     for row in rows:
         writer.writerow({name: spreadsheet(value) for name, value in row.items()})
