@@ -64,6 +64,7 @@ class Pipeline(Configured):
     def __init__(self, config: DictConfig, say: Callable[[str], object] = print, root: Path | None = None):
         self.say, self.root = say, root
         self._chosen: Model | None = None
+        self._simulations: dict[tuple[Case, int], Run] = {}
         self._samples = self._sets = self._taught = self._fitted = None
         super().__init__(config)
 
@@ -177,7 +178,13 @@ class Pipeline(Configured):
 
     def simulation(self, case: Case, scene: Scene | None = None) -> Run:
         """The run of one full-order trajectory, of the scene of training by default."""
-        return naming.simulation(self, case, scene or self.scene)
+        scene = self.scene if scene is None else scene
+        key = case, id(scene)  # a name is asked for often, and takes a millisecond
+        if scene is not self.scene and scene is not self.deployed:
+            return naming.simulation(self, case, scene)
+        if key not in self._simulations:
+            self._simulations[key] = naming.simulation(self, case, scene)
+        return self._simulations[key]
 
     def truth(self, case: Case) -> Run:
         """The run of the full-order trajectory that a deployed one is held to."""
