@@ -30,7 +30,7 @@ def build(make: Callable[[], object], device: str) -> tuple[object, float]:
         solver = make()
         solver.step(WARM_UP)
 
-    peak = peak_mib(begin, device, lambda: solver.nbytes)
+    peak = peak_mib(begin, device, lambda: 0 if solver is None else solver.nbytes)
     return solver, peak
 
 

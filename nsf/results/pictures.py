@@ -7,7 +7,7 @@ full-order run, the model and the baseline.
 import math
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -84,7 +84,12 @@ class Shown:
 
 
 def sections(
-    frame: pd.DataFrame, sources: Sequence[Source], folder: Path, question: "Question", films: bool
+    frame: pd.DataFrame,
+    sources: Sequence[Source],
+    folder: Path,
+    question: "Question",
+    films: bool,
+    advance: Callable[[], object] = lambda: None,
 ) -> list[Section]:
     """Draw the bodies of a report into a folder.
 
@@ -94,6 +99,7 @@ def sections(
         folder: of the report.
         question: what it is about; its superresolve runs are shown, too.
         films: whether bodies are drawn in motion.
+        advance: called after the pictures of each variant.
     """
     opened = {source.id: source for source in sources}
     chosen = list(best(frame))
@@ -106,6 +112,7 @@ def sections(
         baseline = frame[(frame["body"] == body) & (frame["model_name"] == BASELINE)]
         pictures = _of_variant(rows, baseline, opened, folder, stem, bytes_of_one, len(chosen) <= _MANY)
         parts.append(Section(heading, pictures))
+        advance()
     parts += [Section("At each setting", shown)] if (shown := _settings(frame, opened, folder)) else []
     fine = [_fine(of, run, frame, folder) for of, run in question.fine.items() if of in opened]
     return [*parts, *([Section("At many more points", fine)] if fine else [])]

@@ -5,7 +5,7 @@ booktabs), charts and pictures, and `sources.json`: the origin of each run, and 
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.errors import ConfigError
+from nsf.progress import Progress
 from nsf.results import table
 from nsf.results.charts import CHARTS, View
 from nsf.results.charts.bounds import BAD, GOOD, judged, promise
@@ -91,10 +92,12 @@ def build_report(
     with replaced(Path(folder)) as fresh:
         table.write(frame, fresh / "results.csv")
         view = view_of(frame, sources)
-        sections = [
-            Section("Charts", draw(view, fresh, question.plots)),
-            *pictures.sections(view.frame, sources, fresh, question, films),
-        ]
+        bodies = len(list(pictures.best(view.frame)))
+        with Progress("report", len(_named(question.plots)) + bodies, "pictures") as progress:
+            sections = [
+                Section("Charts", draw(view, fresh, question.plots, progress.advance)),
+                *pictures.sections(view.frame, sources, fresh, question, films, progress.advance),
+            ]
         fine = _fine_tables(view.frame, question, fresh)
         runs_of = origins(sources) | _fine_origins(view.frame, question)
         write_pages(question, fresh, sections, runs_of, view, fine, _warnings(sources))
@@ -201,20 +204,29 @@ def view_of(frame: pd.DataFrame, sources: Sequence[Source] = ()) -> View:
     return View(frame, series, stages, trained, logarithmic)
 
 
-def figures(view: View, plots: Sequence[str] | None) -> Iterator[tuple[str, str, Figure]]:
-    """File stem, caption and figure of the charts that are named, or of all."""
-    for name, chart in CHARTS.items():
-        if plots is None or name in plots:
-            for stem, figure in chart.draw(view).items():
-                yield stem, chart.caption, figure
+def _named(plots: Sequence[str] | None) -> list[str]:
+    """The charts that are named, or all, in order."""
+    return [name for name in CHARTS if plots is None or name in plots]
 
 
-def draw(view: View, folder: Path, plots: Sequence[str] | None) -> list[Picture]:
-    """Charts as SVG and PNG in a folder, with their captions and runs."""
+def figures(
+    view: View, plots: Sequence[str] | None, advance: Callable[[], object] = lambda: None
+) -> Iterator[tuple[str, str, Figure]]:
+    """File stem, caption and figure of the charts that are named, or of all; counts each chart."""
+    for name in _named(plots):
+        for stem, figure in CHARTS[name].draw(view).items():
+            yield stem, CHARTS[name].caption, figure
+        advance()
+
+
+def draw(
+    view: View, folder: Path, plots: Sequence[str] | None, advance: Callable[[], object] = lambda: None
+) -> list[Picture]:
+    """Charts as SVG and PNG in a folder, with their captions and runs; counts each chart."""
     runs = sorted(set(view.frame["run"]) - {""})
     return [
         Picture(save(figure, folder, stem, ramps=[COLORS]), caption, runs)
-        for stem, caption, figure in figures(view, plots)
+        for stem, caption, figure in figures(view, plots, advance)
     ]
 
 

@@ -13,7 +13,7 @@ from nsf.bench import bench
 from nsf.bench.batch import _too_large, cases_of
 from nsf.bench.batch import measured as measured_batches
 from nsf.bench.full_order import collapse, pass_times
-from nsf.bench.measure import WholeRun, bandwidth, turns, window_times
+from nsf.bench.measure import WholeRun, bandwidth, build, turns, window_times
 from nsf.bench.reduced import measured as measured_chain
 from nsf.bench.reduced import measured_networks
 from nsf.bench.report import (
@@ -175,6 +175,14 @@ def test_windows_and_whole_runs_take_turns():
     found = turns({name: WholeRun(solver, 5) for name, solver in solvers.items()}, 2, "cpu")
     assert done == 3 * ["restart a", ("a", 5), "restart b", ("b", 5)]
     assert [len(times) for times in found.values()] == [2, 2]
+
+
+def test_a_solver_that_is_refused_says_why():
+    def make():
+        raise ConfigError("too thin for the grid")
+
+    with pytest.raises(ConfigError, match="too thin"):
+        build(make, "cpu")
 
 
 def test_a_floor_is_bytes_over_the_bandwidth_of_a_copy(monkeypatch):

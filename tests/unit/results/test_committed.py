@@ -17,7 +17,7 @@ from nsf.results.question import Question
 from nsf.results.report import build_report
 
 
-def body(frame, sources, folder, question, films):
+def body(frame, sources, folder, question, films, advance):
     """A stand-in for pictures of bodies."""
     Image.new("RGB", (8, 8), "white").save(folder / "strip.png")
     return [Section("Bodies", [Picture(["strip.png"], "A body.", sorted(set(frame["run"])))])]
