@@ -48,6 +48,7 @@ def test_a_chain_that_is_there(nsf, chain):
     }
     assert "in all" not in out
     assert re.search(r"particles +500\b", out)
+    assert re.search(r"memory +\S+ MiB of a full-order run; 2.57 MiB of 75 training frames", out)
     assert re.search(r"Δt = 0.005 s; up to 0.00\d+ s is stable", out)
     assert "21" not in out.split("test")[0].split("train")[1]
     assert chain.pipeline.training.hash in out
