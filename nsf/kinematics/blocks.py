@@ -41,8 +41,13 @@ def _as_tf32(values: Tensor) -> Tensor:
 def coordinates(values: Tensor, modes: Tensor) -> Tensor:
     """Products [F, k] of few rows [F, n] with modes [n, k], n ≫ F, k.
 
-    Summed over slices of n: in one product of that shape most of a GPU may be idle.
+    In one product of that shape most of a GPU may be idle, so there it is summed over slices of n.
     """
+    return in_slices(values, modes) if values.is_cuda else values @ modes
+
+
+def in_slices(values: Tensor, modes: Tensor) -> Tensor:
+    """`coordinates`, summed over slices of n."""
     width = len(modes) // _SLICES
     whole = _SLICES * width
     parts = values[:, :whole].unflatten(1, (_SLICES, width)).transpose(0, 1)

@@ -69,7 +69,7 @@ class Configured:
         self.configured.refuse(self)
         self.deployed = self._deployed(c.deploy.changes)
         for scene in (self.scene, self.deployed):
-            check_every(c.data.every, scene.steps, c.fallback)
+            check_every(c.data.every, scene.steps)
         self.device = _device(c.device)
 
     def _deployed(self, changes: DictConfig | None) -> Scene:

@@ -71,26 +71,16 @@ def factors(key: str, value) -> list[int]:
     return numbers
 
 
-def check_every(every: int, steps: int, fallback: str) -> None:
-    """Refuse stored frames between which the end of a run lies, or of which a continuation has others.
-
-    Args:
-        every: steps from a stored frame to the next.
-        steps: of a run.
-        fallback: who goes on with a run that is not believed.
+def check_every(every: int, steps: int) -> None:
+    """Refuse stored frames between which the end of a run lies.
 
     Raises:
-        ConfigError: says which to set.
+        ConfigError: the steps from a frame to the next do not divide those of a run; says what does.
     """
     if steps % every:
         near = max(k for k in range(1, every) if steps % k == 0)
         raise ConfigError(
             f"data.every={every} does not divide the {steps} steps of a run; set data.every={near}"
-        )
-    if every > 1 and fallback == "full":
-        raise ConfigError(
-            f"fallback=full stores each step, and data.every is {every}; set data.every=1, or "
-            "fallback=projected or none"
         )
 
 

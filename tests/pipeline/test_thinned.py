@@ -1,6 +1,7 @@
 """`data.every`: runs of which only some frames are stored, and what is trained and compared on these."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -88,11 +89,18 @@ def test_a_recurrence_is_taught_each_step(thinned):
     assert np.isfinite(thinned.taught.manifest["metrics"]["errors"]).all()
 
 
+def test_a_full_order_run_has_no_error(thinned, pipeline_at):
+    full = pipeline_at(thinned.root, *THINNED, "model=full")
+    for stage in ("deploy", "evaluate"):
+        full.run(stage)
+    row = pd.read_csv(full.evaluation.path / "results.csv").iloc[0]
+    assert row["displacement_error"] == 0.0
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["data.every=5"], "data.every=5 does not divide the 24 steps of a run; set data.every=4"),
-        (["data.every=4", "fallback=full"], "set data.every=1, or fallback=projected or none"),
         (["data.every=4", "model=interpolate"], "set data.every=1"),
         (["data.every=4", "sampler=cubature"], "set data.every=1, or sampler=random"),
     ],

@@ -44,10 +44,10 @@ def test_a_block_has_a_frame_at_least():
 
 
 @pytest.mark.parametrize("n", [90, 128, 1001])
-def test_coordinates_are_those_of_one_product(n):
+def test_a_product_in_slices_is_that_of_all(n):
     generator = torch.Generator().manual_seed(0)
     values, modes = (torch.randn(*shape, generator=generator).double() for shape in ((7, n), (n, 5)))
-    torch.testing.assert_close(blocks.coordinates(values, modes), values @ modes)
+    torch.testing.assert_close(blocks.in_slices(values, modes), values @ modes)
 
 
 @pytest.mark.gpu
