@@ -21,6 +21,7 @@ MAIN = {
     "evaluate": ("delta", "δ"),
     "superresolve": ("delta", "δ"),
     "train": ("deformation_loss", "loss of g"),
+    "deploy": ("light", "error bounds"),
 }
 #: Shown in place of a value that a run lacks.
 ABSENT = "–"

@@ -20,6 +20,8 @@ from nsf.pipeline.stages.encoding import encoded_runs
 from nsf.recurrence.solids import collider_states
 from nsf.vectors import spaced
 
+#: Why a run of a validation case has no bound.
+CALIBRATES = "validation cases say how large errors are"
 _PARTICLES, _FRAMES = 500, 51
 
 
@@ -40,7 +42,7 @@ def calibrated(pipeline, manifold: Manifold) -> Trust:
     if not rollouts:
         at_validation = pipeline.config.deploy.split == "validation"
         trust = Trust.of(manifold, trust.limit, reach)
-        trust.unknown = "validation cases say how large errors are" if at_validation else Trust.unknown
+        trust.unknown = CALIBRATES if at_validation else Trust.unknown
         return trust
     calibration = _calibration(validating, manifold, trust, rollouts)
     return trust.calibrated(reach, [rollout.case.parameters for rollout in rollouts], calibration)

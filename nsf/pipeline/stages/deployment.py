@@ -22,11 +22,12 @@ from nsf.deployment import (
     deploy,
     rollout_file,
 )
+from nsf.deployment.trust import percent
 from nsf.dynamics import ReducedBatch
 from nsf.kinematics.manifold import Manifold
 from nsf.models import Auto, FullOrder, Projected
 from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
-from nsf.pipeline.stages.calibration import calibrated
+from nsf.pipeline.stages.calibration import CALIBRATES, calibrated
 from nsf.pipeline.stages.choosing import measure_candidates
 from nsf.runs import Record, Run
 from nsf.storage import writing
@@ -66,17 +67,19 @@ def deploy_held_out(pipeline, run: Run) -> None:
                 shutil.copyfile(truth, record.path / continuation_file(index))
                 record.output(continuation_file(index))
         write_configuration(pipeline, record)
-        flags = [rollout.verdict.flag for rollout in rollouts]
+        flags, bound = zip(*((r.verdict.flag, r.verdict.bound_share) for r in rollouts), strict=True)
         record.metrics["seconds"] = [r.seconds for r in rollouts]
         record.metrics["by"] = [r.by for r in rollouts]
         record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
         record.metrics["diverged"] = [r.case.column for r in rollouts if r.diverged >= 0]
         record.metrics["flags"] = {flag: flags.count(flag) for flag in FLAGS}
-    together = record.metrics["batch"]
+        lights = ", ".join(f"{flags.count(flag)} {flag}" for flag in FLAGS if flag in flags)
+        record.metrics["light"] = lights if np.isnan(bound).all() else f"{lights}: ≤ {percent(np.nanmax(bound))}"
+    together, validating = record.metrics["batch"], pipeline.config.deploy.split == "validation"
     at_once = f", {together} together" if together > 1 else ""
     pipeline.say(
         f"deploy: model={pipeline.model.name}, |S|={rollouts[0].sample}, "
-        f"{len(rollouts)} cases{at_once} → {run.id}"
+        f"{len(rollouts)} {'validation ' * validating}cases{at_once} → {run.id}"
     )
 
 
@@ -165,7 +168,7 @@ def _told(rollout: Rollout) -> list[str]:
     """Lines for the user: whether a run is to be believed, and what went wrong."""
     named = rollout.case.named
     by = f" by {rollout.by}" if rollout.by else ""
-    lines = [f"{named}{by}: {rollout.verdict.text}"]
+    lines = [f"{named}{by}: {rollout.verdict.text}"] if rollout.verdict.reason != CALIBRATES else []
     if rollout.diverged >= 0:
         lines.append(
             f"warning: {named} diverged at step {rollout.diverged} (off the grid or not finite); "
