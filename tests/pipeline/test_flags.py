@@ -80,6 +80,19 @@ def test_validation_cases_in_a_corner(rows):
     assert table["error_bound"][1] > table["error_bound"][0]
 
 
+def test_a_parameter_may_turn_gravity(rows):
+    """Gravity of training is that of the training cases, not that of the scene without a case."""
+    turned = ("+scene.inclination={_target_:nsf.scenes.Inclination,angle:0}", "model=interpolate")
+    angle = (
+        "~scene.parameters.friction_angle",
+        "+scene.parameters.angle={key:scene.inclination.angle,unit:deg}",
+    )
+    design = ("scene.design.train=[0,5,10]", "scene.design.validation=[3,8]", "scene.design.test=[4,14]")
+    _, table, _ = rows(*turned, *angle, *design)
+    assert table["beyond"].tolist() == [0, 1]
+    assert table["flag"][0] != "red"
+
+
 def test_a_red_run_is_taken_whole_by_the_fallback(rows):
     _, table, said = rows(*QUICK, "fallback=projected")
     assert table["fallback_share"].tolist() == [1.0, 1.0]

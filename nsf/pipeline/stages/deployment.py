@@ -74,7 +74,8 @@ def deploy_held_out(pipeline, run: Run) -> None:
         record.metrics["diverged"] = [r.case.column for r in rollouts if r.diverged >= 0]
         record.metrics["flags"] = {flag: flags.count(flag) for flag in FLAGS}
         lights = ", ".join(f"{flags.count(flag)} {flag}" for flag in FLAGS if flag in flags)
-        record.metrics["light"] = lights if np.isnan(bound).all() else f"{lights}: ≤ {percent(np.nanmax(bound))}"
+        most = "" if np.isnan(bound).all() else f": ≤ {percent(np.nanmax(bound))}"
+        record.metrics["light"] = lights + most
     together, validating = record.metrics["batch"], pipeline.config.deploy.split == "validation"
     at_once = f", {together} together" if together > 1 else ""
     pipeline.say(
