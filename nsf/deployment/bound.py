@@ -16,8 +16,6 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from nsf.errors import SchemaError
-
 #: Share of runs in which a bound holds.
 LEVEL = 0.9
 #: Standard deviation of the logarithm of errors of runs of one model: between 0.3 and 0.6 in the committed
@@ -157,15 +155,10 @@ class Calibration:
         """From plain containers.
 
         Raises:
-            SchemaError: they are none of a calibration.
+            ValueError: times and curve do not fit.
         """
-        try:
-            arrays = {name: np.asarray(content[name], float) for name in ("t", "curve", "errors")}
-            numbers = {name: float(content[name]) for name in ("slope", "displacement")}
-            for name in _FACTORS:
-                numbers[name] = math.inf if content[name] is None else float(content[name])
-            if not (len(arrays["t"]) == len(arrays["curve"]) and (np.diff(arrays["t"]) > 0).all()):
-                raise ValueError("times and curve do not fit")
-            return cls(**arrays, **numbers, lost=int(content["lost"]))
-        except (KeyError, TypeError, ValueError) as error:
-            raise SchemaError(f"it holds no calibration ({error}); deploy again") from error
+        values = {name: np.asarray(content[name], float) for name in ("t", "curve", "errors")}
+        if values["t"].shape != values["curve"].shape or (np.diff(values["t"]) <= 0).any():
+            raise ValueError("times and curve do not fit")
+        factors = {name: math.inf if content[name] is None else content[name] for name in _FACTORS}
+        return cls(**content | values | factors)

@@ -5,7 +5,6 @@ far its latent vectors are from those of training and what its projections left.
 errors are at such signals (`nsf.deployment.bound`). Not in the paper.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from nsf import schemas
 from nsf.deployment.bound import RED, Calibration, flag_of, rms
 from nsf.deployment.reach import Reach
 from nsf.dynamics import ReducedMPM
@@ -29,6 +29,21 @@ TRUST = "trust.json"
 _PARTICLES, _ROWS, _NEAREST = 500, 256, 4096
 #: Growth of a bound a side of the box of parameters away from the nearest validation case.
 _AWAY = 0.5
+
+
+_BAND = {"low": [float], "high": [float], "leeway": float}
+_REACH = {
+    "names": [str], "box": [[float]], "gravity": [float], "radius": float, "solids": (_BAND, None),
+    "states": _BAND, "changed": str,
+}  # fmt: skip
+_CALIBRATION = {
+    "t": [float], "curve": [float], "slope": float, "factor": (float, None), "typical": (float, None),
+    "displacement": float, "errors": [float], "lost": int,
+}  # fmt: skip
+_FILE = {
+    "limit": float, "metric": [[float]], "reach": _REACH, "calibration": (_CALIBRATION, None),
+    "validated": [[float]],
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -151,19 +166,16 @@ class Trust:
         Raises:
             SchemaError: the file is none.
         """
+        r, taught = manifold.latent_dim, manifold.training_latents.double().cpu().numpy()
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            metric = np.asarray(content["metric"], float)
-            calibration = content["calibration"] and Calibration.read(content["calibration"])
-            r = manifold.latent_dim
-            if metric.shape != (r, r):
-                raise ValueError(f"metric has shape {metric.shape}, not ({r}, {r})")
-            taught = manifold.training_latents.double().cpu().numpy()
-            validated = np.asarray(content["validated"], float)
-            return cls(
-                metric, taught, float(content["limit"]), Reach.read(content["reach"]), calibration, validated
-            )
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+            content = schemas.read(path, _FILE)
+            reach, calibration = Reach.read(content["reach"]), content["calibration"]
+            calibration = None if calibration is None else Calibration.read(calibration)
+            metric, validated = (np.asarray(content[name], float) for name in ("metric", "validated"))
+            if metric.shape != (r, r) or reach.states.low.shape != (r,):
+                raise ValueError(f"it is not of {r} latent coordinates")
+            return cls(metric, taught, content["limit"], reach, calibration, validated)
+        except (SchemaError, ValueError) as error:
             raise SchemaError(f"{path} is no calibration of errors ({error}); deploy again") from error
 
     def save(self, path: Path) -> None:
