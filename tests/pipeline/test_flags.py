@@ -80,6 +80,15 @@ def test_validation_cases_in_a_corner(rows):
     assert table["error_bound"][1] > table["error_bound"][0]
 
 
+def test_cases_are_drawn_from_the_whole_range(rows):
+    """Training cases do not reach its ends; a case that is drawn there is none beyond."""
+    drawn = "scene.design={_target_:nsf.scenes.Sobol,train:4,validation:2,test:2}"
+    pipeline, _, _ = rows("+scene.parameters.friction_angle.range=[22,38]", drawn, "model=interpolate")
+    trust = Trust.open(pipeline.deployment.file(TRUST), pipeline.manifold())
+    assert trust.reach.box.tolist() == [[22.0, 38.0]]
+    assert pipeline.split.box.tolist() != [[22.0, 38.0]]
+
+
 def test_a_parameter_may_turn_gravity(rows):
     """Gravity of training is that of the training cases, not that of the scene without a case."""
     turned = ("+scene.inclination={_target_:nsf.scenes.Inclination,angle:0}", "model=interpolate")

@@ -18,6 +18,7 @@ from nsf.kinematics.manifold import Manifold
 from nsf.models.drawn import Drawn
 from nsf.pipeline.stages.encoding import encoded_runs
 from nsf.recurrence.solids import collider_states
+from nsf.scenes import Scene, Values
 from nsf.vectors import spaced
 
 #: Why a run of a validation case has no bound.
@@ -86,7 +87,6 @@ def _at(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Reach:
     """What was taught: parameters, forcing, and latent states of training runs, and of drawn ones."""
     scene = pipeline.scene
-    parameters = manifold.training_parameters.double().cpu().numpy()
     latents = manifold.training_latents.double().cpu().numpy()
     runs, t = [scene.at(case) for case in pipeline.split.train], scene.dt * np.arange(scene.steps)
     if scene.forcing.gravity:  # what programs may add, rather than what those of training did
@@ -105,13 +105,24 @@ def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollou
     gravity = acting.mean((0, 1))
     return Reach(
         names=tuple(manifold.parameter_names),
-        box=np.stack([parameters.min(0), parameters.max(0)], 1),
+        box=_box(scene, manifold),
         gravity=gravity,
         radius=reach + float(np.linalg.norm(acting - gravity, axis=-1).max()),
         solids=Band.of_solids(solids, scene.dt) if scene.forcing.colliders else None,
         states=Band.of_states(latents @ trust.metric, [rollout.xhat @ trust.metric for rollout in rollouts]),
         changed=", ".join(pipeline.config.deploy.changes or ()),
     )
+
+
+def _box(scene: Scene, manifold: Manifold) -> np.ndarray:
+    """[n, 2] ranges of the parameters: those of training, and all that a design draws cases from."""
+    parameters = manifold.training_parameters.double().cpu().numpy()
+    box = np.stack([parameters.min(0), parameters.max(0)], 1)
+    for ends, name in zip(box, manifold.parameter_names, strict=True):
+        drawn = scene.parameters[name].range
+        if drawn is not None and not isinstance(scene.design, Values):
+            ends[:] = min(ends[0], drawn[0]), max(ends[1], drawn[1])
+    return box
 
 
 def beyond(pipeline, trust: Trust, case: Case, encoded: np.ndarray) -> bool:
