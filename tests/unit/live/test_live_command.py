@@ -138,7 +138,7 @@ def test_what_bench_measures(chain, model, player):
     from nsf.live.bench import follow, sizes
 
     found = sizes(player)
-    assert found["frame"] == 2 + 4 * (2 + 4)
+    assert found["frame"] == 2 + 4 * (3 + 4)  # t, error, bound and x̂
     assert found["positions"] == 12 * 500
     table = follow(player)
     assert table["shown step"].tolist() == [6, 12, 24]
