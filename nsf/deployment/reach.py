@@ -11,8 +11,8 @@ from nsf.recurrence.solids import FEATURES
 _ROUND_OFF = 1e-6
 #: Times as far as other runs went beyond the ranges that a new one of the kind may go.
 _AGAIN = 2.0
-#: Of the size of the ranges of latent states: what a run may leave them by.
-_LEAST = 0.1
+#: Of the size of the ranges of latent states: what a run may leave them by, at least and at most.
+_LEAST, _MOST = 0.1, 1.0
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,8 @@ class Band:
     def of_states(cls, rows: np.ndarray, others: Sequence[np.ndarray]) -> "Band":
         """Of latent states [K, r] [m] of training runs; others: [N, r] of validation runs."""
         one = cls(rows.min(0), rows.max(0), 0.0)
-        off = [float(np.max(one.together(states), initial=0.0)) for states in others]
-        return cls(
-            one.low, one.high, max([_LEAST, *(_AGAIN * beyond for beyond in off if np.isfinite(beyond))])
-        )
+        beyond = max((float(np.max(one.together(states))) for states in others), default=0.0)
+        return cls(one.low, one.high, float(np.clip(_AGAIN * beyond, _LEAST, _MOST)))
 
     def each(self, rows: np.ndarray) -> np.ndarray:
         """[..., f] how far each number is beyond its range, over half of the range; 0 inside."""
