@@ -238,10 +238,9 @@ def _carried(side: FullOrder, steps: Sequence[int], X: torch.Tensor, device: str
 
 def _add_ratios(figures: Measurements, recurrence: Case, times: Mapping[Case, Sequence[float]]) -> None:
     """Add how many times as long the others take as the run by recurrence, all of its frames decoded."""
-    own = float(np.median(times[recurrence]))
+    decoded, size = float(np.median(times[recurrence])), recurrence.name.removeprefix("recurrence")
     for case, ms in times.items():
         if case != recurrence:
-            own_name = recurrence.name.removeprefix("recurrence")
-            what = f"{case.name.replace(own_name, '').replace('_', ' ')} {case.precision}"
-            ratio = figures.add(recurrence, f"time of {what} over it", float(np.median(ms)) / own, "1")
-            figures.say(f"{recurrence.name}: {own:.4g} ms; {what}: {ratio:.4g} times")
+            what = f"{case.name.replace(size, '').replace('_', ' ')} {case.precision}"
+            ratio = figures.add(recurrence, f"time of {what} over it", float(np.median(ms)) / decoded, "1")
+            figures.say(f"{recurrence.name}: {decoded:.4g} ms; {what}: {ratio:.4g} times")

@@ -1,4 +1,4 @@
-"""Processes beside this one, a core each: they share full-order runs on a CPU."""
+"""Helping processes, a core each, with which this one shares full-order runs on a CPU."""
 
 import contextlib
 import os
@@ -14,7 +14,7 @@ from joblib.externals.loky import ProcessPoolExecutor, cpu_count
 
 from nsf.memory import host_memory
 
-_POLL = 0.05  # [s] between looks at how far the others have come
+_POLL = 0.05  # [s] between looks at how far the helpers have come
 _STEPS = "steps"  # file of these
 #: Steps of particles, some seconds of them, from which on other processes are worth their start.
 _WORTH = 1_000_000
@@ -34,8 +34,8 @@ def cores(device: str) -> int:
     return min(cpu_count(), int(threads)) if threads.isdigit() and int(threads) else cpu_count()
 
 
-def helpers(device: str, scenes: Sequence, nbytes: int) -> int:
-    """Processes beside this one that are worth their start, one for each further core at most.
+def helper_count(device: str, scenes: Sequence, nbytes: int) -> int:
+    """How many helping processes are worth their start, one for each further core at most.
 
     Args:
         device: of the runs.
@@ -48,8 +48,8 @@ def helpers(device: str, scenes: Sequence, nbytes: int) -> int:
     return max(1, min(cores(device), len(scenes), host_memory() // max(1, nbytes))) - 1
 
 
-class Others:
-    """The processes beside this one; without any, this one does all.
+class Helpers:
+    """The helping processes; without any, this one does all.
 
     Args:
         folder: that all map their steps in, and claim runs in.
@@ -80,7 +80,7 @@ class Others:
 
 
 @contextlib.contextmanager
-def beside(work: Callable[[int, Advance, Path], object], count: int, advance: Advance) -> Iterator[Others]:
+def helping(work: Callable[[int, Advance, Path], object], count: int, advance: Advance) -> Iterator[Helpers]:
     """Let other processes work while the block does; each has one thread.
 
     Results do not depend on how many there are if they share out runs, and not parts of them.
@@ -93,20 +93,20 @@ def beside(work: Callable[[int, Advance, Path], object], count: int, advance: Ad
     with TemporaryDirectory(prefix="nsf-") as name:
         folder = Path(name)
         if not count:
-            yield Others(folder, (), advance)
+            yield Helpers(folder, (), advance)
             return
         np.zeros(count + 1, np.int64).tofile(folder / _STEPS)  # the last one tells all to stop
         pool = ProcessPoolExecutor(count, initializer=_begin, env={"OMP_NUM_THREADS": "1"})
         try:
             futures = [pool.submit(_work, work, number, folder) for number in range(count)]
-            yield Others(folder, futures, advance)
+            yield Helpers(folder, futures, advance)
         finally:
             _steps_in(folder)[-1] = 1
             pool.shutdown()
 
 
 def claimed(folder: Path, run: int) -> bool:
-    """Whether a run, by its number, is for this process: it is the first of those beside it to ask."""
+    """Whether a run, by its number, is for this process: no helper was before it."""
     try:
         (folder / f"{run}").touch(exist_ok=False)
     except FileExistsError:
@@ -115,7 +115,7 @@ def claimed(folder: Path, run: int) -> bool:
 
 
 def _begin() -> None:
-    """A process beside another leaves interrupts to that."""
+    """A helper leaves interrupts to the process that it helps."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -49,7 +49,7 @@ def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeyp
 def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_path, monkeypatch):
     """Bit for bit, and the bar ends at its total."""
     counted = []
-    monkeypatch.setattr(simulation, "helpers", lambda *of: 1)
+    monkeypatch.setattr(simulation, "helper_count", lambda *of: 1)
     monkeypatch.setattr(Progress, "advance", lambda self, count=1: counted.append(count))
     pipeline = pipeline_at(tmp_path)
     for run in pipeline.simulate():
@@ -76,23 +76,23 @@ def go_on(number, advance, folder):
         advance(1)
 
 
-def test_processes_beside_this_one_count_here():
+def test_helping_processes_count_here():
     steps = []
-    with cores.beside(count, 1, steps.append) as others:
-        assert cores.claimed(others.folder, 1)
-        ((number, process, claimed),) = others.results()
-        assert not cores.claimed(others.folder, 0)
+    with cores.helping(count, 1, steps.append) as helpers:
+        assert cores.claimed(helpers.folder, 1)
+        ((number, process, claimed),) = helpers.results()
+        assert not cores.claimed(helpers.folder, 0)
     assert (number, claimed, sum(steps)) == (0, True, 3)
     assert process != os.getpid()
 
 
 def test_an_error_of_another_process_is_one_here():
-    with pytest.raises(InstabilityError, match="it burst"), cores.beside(fail, 1, print) as others:
-        others.results()
+    with pytest.raises(InstabilityError, match="it burst"), cores.helping(fail, 1, print) as helpers:
+        helpers.results()
 
 
 def test_processes_end_where_this_one_fails():
-    with pytest.raises(KeyboardInterrupt), cores.beside(go_on, 1, lambda steps: None):
+    with pytest.raises(KeyboardInterrupt), cores.helping(go_on, 1, lambda steps: None):
         raise KeyboardInterrupt
 
 
@@ -108,6 +108,6 @@ def test_helpers_are_as_many_as_are_worth_it_and_fit(chain, monkeypatch):
     monkeypatch.setattr(cores, "cores", lambda device: 8)
     monkeypatch.setattr(cores, "host_memory", lambda: 2**30)
     few, many = [chain.scene] * 4, [chain.scene] * 400
-    assert [cores.helpers("cpu", runs, 2**20) for runs in (few, many)] == [0, 7]
-    assert cores.helpers("cpu", many, 2**28) == 3  # four at once
-    assert cores.helpers("cpu", many, 2**31) == 0
+    assert [cores.helper_count("cpu", runs, 2**20) for runs in (few, many)] == [0, 7]
+    assert cores.helper_count("cpu", many, 2**28) == 3  # four at once
+    assert cores.helper_count("cpu", many, 2**31) == 0

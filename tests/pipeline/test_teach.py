@@ -141,7 +141,7 @@ def same_runs(one, other):
 @pytest.mark.slow
 def test_runs_by_several_processes_are_the_same(lesson, copied, pipeline_at, monkeypatch):
     pipeline, _ = lesson
-    monkeypatch.setattr(encoding, "helpers", lambda *of: 1)
+    monkeypatch.setattr(encoding, "helper_count", lambda *of: 1)
     same_runs(encoded(pipeline_at(copied("simulate", "train"), *TAUGHT)), pipeline.encoding)
 
 

@@ -20,7 +20,7 @@ from nsf.errors import InstabilityError
 from nsf.kinematics.manifold import Manifold
 from nsf.models.inputs import Lessons
 from nsf.models.lookup import inputs_in
-from nsf.pipeline.cores import Advance, beside, claimed, helpers
+from nsf.pipeline.cores import Advance, claimed, helper_count, helping
 from nsf.progress import Progress
 from nsf.recurrence.stream import (
     Encoded,
@@ -172,14 +172,14 @@ def _stream(pipeline, encoder: Encoder, missing, after: Callable[[int], object])
     share = partial(_share, missing, how)
     help_with = partial(_help, share, pipeline.training.file(_MANIFOLD), encoder.stress)
     size = host_bytes(pipeline.scene, pipeline.config.precision)
-    count = helpers(device, [lesson.scene for lesson, _ in missing], size)
-    with beside(help_with, count, after) as others:
+    count = helper_count(device, [lesson.scene for lesson, _ in missing], size)
+    with helping(help_with, count, after) as helpers:
 
         def advance(steps: int) -> None:
             after(steps)
-            others.look()
+            helpers.look()
 
-        ends = [*share(encoder, advance, others.folder), *chain.from_iterable(others.results())]
+        ends = [*share(encoder, advance, helpers.folder), *chain.from_iterable(helpers.results())]
     return [end for end in ends if end]
 
 
@@ -191,7 +191,7 @@ def _help(
 
 
 def _share(missing, how: tuple[str, str], encoder: Encoder, advance: Advance, folder: Path) -> list[str]:
-    """Make the runs that no other process makes; why some are lost, empty texts for others."""
+    """Make the runs that no other process makes; why some are lost, empty texts for helpers."""
     return [
         _run(encoder, how, *pair, lambda: advance(1))
         for index, pair in enumerate(missing)

@@ -20,7 +20,7 @@ from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
 from nsf.pipeline.checks import check_room
-from nsf.pipeline.cores import Advance, beside, helpers
+from nsf.pipeline.cores import Advance, helper_count, helping
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.scenes import Scene
@@ -60,7 +60,7 @@ class Shared:
         dx: grid spacing [m], for the file.
         stored: precision of the stored frames.
         device, precision: of the physics, for the manifest.
-        helpers: processes beside this one, which share the jobs.
+        helpers: how many helping processes share the jobs.
     """
 
     steps: int
@@ -113,17 +113,17 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
     frames, help_with = len(jobs) * shared.frames, partial(_help, jobs, shared)
     with (
         Progress("simulate", frames, "frames") as progress,
-        beside(help_with, shared.helpers, progress.advance) as others,
+        helping(help_with, shared.helpers, progress.advance) as helpers,
         ThreadPoolExecutor(_WRITERS) as pool,
     ):
 
         def advance(count: int = 1) -> None:
             progress.advance(count)
-            others.look()
+            helpers.look()
 
         writing, left = _share(jobs, shared, pool, HostMemory(), advance, say, progress.describe)
         made = len(writing)
-        for count, lines in others.results():
+        for count, lines in helpers.results():
             made += count
             for line in lines:
                 say(line)
@@ -300,6 +300,6 @@ def make(
 
     jobs = [job(run, *needed) for run, needed in runs.items()]
     scenes, steps, dx = [scene for _, scene in runs.values()], pipeline.scene.steps, pipeline.scene.dx
-    count = helpers(device, scenes, host_bytes(pipeline.scene, c.precision, pipeline.stored))
+    count = helper_count(device, scenes, host_bytes(pipeline.scene, c.precision, pipeline.stored))
     shared = Shared(steps, every, dx, pipeline.stored, device, c.precision, count)
     return simulate(jobs, shared, pipeline.say)
