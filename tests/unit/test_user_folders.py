@@ -117,6 +117,7 @@ def test_jobs_in_other_processes_have_it_too(folder):
 
 
 def test_a_folder_that_is_not_named_is_hinted_at(folder, monkeypatch, capsys):
+    monkeypatch.setenv(paths.VARIABLE, "")
     folder.rename(folder.with_name("conf"))
     monkeypatch.chdir(folder.parent)
     assert "conf has it: add --config-dir conf" in told(capsys, "run", "scene=dune")
