@@ -54,7 +54,7 @@ _CONSOLE = (
 )
 _TELLING = ("variant", "case", "cases", "paper_delta")  # shown where they vary
 _DRAWS = 10_000  # of seeds and cases, for the interval of a mean
-BEYOND = " (programs beyond what was taught)"
+BEYOND = " (beyond)"
 """Ends the variant of rows whose program led beyond what was taught; no mean of the others counts them."""
 TAKEN = " (taken by the fallback)"
 """Ends the variant of rows whose runs another model took, likewise."""

@@ -32,7 +32,8 @@ _LOG = ("sampler.size", "training_runs", "trainer.steps", "particles", "train_se
 
 @chart(
     "Displacement error at each held-out program, the mean over seeds (dots), and their median (line): of "
-    "every model, and below the line of rivals that need none. A dot at the right edge is a run that is lost."
+    "every model, and below the line of rivals that need none. A dot at the right edge is a run that is lost; "
+    "(beyond) are programs that led beyond what was taught."
 )
 def programs(view: View) -> Figures:
     """Displacement error of every program by model, a panel a body; of scenes that programs force."""
@@ -41,7 +42,7 @@ def programs(view: View) -> Figures:
         return {}
     groups = list(forced.groupby("body", sort=False))
     most = max(part["variant"].nunique() for _, part in groups) + len(RIVALS)
-    fig, drawn = panels(len(groups), max(3.0, 0.6 + 0.27 * most), 2)
+    fig, drawn = panels(len(groups), max(3.0, 0.6 + 0.3 * most), 2)
     for panel, (body, part) in zip(drawn, groups, strict=True):
         rows = {
             name: _of_programs(one["displacement_error"], one)
@@ -55,7 +56,7 @@ def programs(view: View) -> Figures:
             color = REDUCED if y < models else MUTED
             _dots(panel, y, errors, color)
         panel.axhline(models - 0.5, color=MUTED, lw=0.8)
-        panel.set_yticks(range(len(rows)), ["\n".join(textwrap.wrap(name, 30)) for name in rows])
+        panel.set_yticks(range(len(rows)), ["\n".join(textwrap.wrap(name, 32)) for name in rows])
         panel.set(title=body, xlabel=ERROR, ylim=(len(rows) - 0.45, -0.55))
         panel.tick_params(axis="y", length=0)
     return {"programs": fig}
