@@ -32,7 +32,7 @@ _LOG = ("sampler.size", "training_runs", "trainer.steps", "particles", "train_se
 
 @chart(
     "Displacement error at each held-out program, the mean over seeds (dots), and their median (line): of "
-    "every model, and below the line of rivals that need none. A dot at the right edge is a run that is lost; "
+    "every model, and below the line of rivals that need none. A dot at the right edge is a lost run; "
     "(beyond) are programs that led beyond what was taught."
 )
 def programs(view: View) -> Figures:
