@@ -75,10 +75,10 @@ def test_a_scene_of_a_chain_that_is_there():
     assert "12,500" in list(shown.columns[1].cells)
 
 
-def test_trajectories_take_what_their_bytes_say(chain, tiny):
+def test_trajectories_take_what_their_bytes_say(chain, tiny, monkeypatch):
+    monkeypatch.setenv("NSF_RUNS", str(chain.root))
     words = [word for word in tiny if not word.startswith("scene.design.train")]
     (names,) = preview.plans([(*words, "scene.design.train=[21,25,35]")])
-    names.root = chain.root
     told = preview.expected("simulate", {run: names for run in names.runs_of("simulate")})
     of_one = chain.trajectory(26.0).stat().st_size
     assert (told.runs, told.made) == (4, 1)
