@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
 
 from nsf.results.formats import plain
@@ -86,7 +86,13 @@ _LETTER = 5.5  # [pt] width of a letter of a legend, or of a number below an axi
 _ENTRY = 40.0  # [pt] width of what is about a legend's entry
 _ROW = 16.5  # [pt] height of a legend's row, about
 _MOST_COLUMNS = 6  # of a legend
-_SPARSER = ((1, 2, 3, 4, 5, 6, 8), (1, 2, 5), (1, 3), (1,))  # ticks of a decade, where more would touch
+_SPARSER = (
+    (1, 2, 3, 4, 5, 6, 8),
+    (1, 2, 5),
+    (1, 2, 4, 8),
+    (1, 3),
+    (1,),
+)  # ticks of a decade, where more would touch
 _CELL = 4  # levels of a channel that Pillow does not tell apart when it looks up a colour
 
 
@@ -185,13 +191,13 @@ def _set_apart(fig: Figure) -> None:
     if logarithmic:
         fig.get_layout_engine().execute(fig)  # labels beside a panel take of its width
     for panel in logarithmic:
-        sparser = (LogLocator(subs=subs) for subs in _SPARSER)
-        for locator in itertools.chain([panel.xaxis.get_major_locator()], sparser):
-            if len(ticks := _ticks(panel, locator)) < 2:
-                break
-            panel.xaxis.set_major_locator(locator)
-            if _have_room(panel, ticks):
-                break
+        present = panel.xaxis.get_major_locator()
+        for locator in itertools.chain([present], (LogLocator(subs=subs) for subs in _SPARSER)):
+            ticks = _ticks(panel, locator)
+            if len(ticks) >= 2:
+                panel.xaxis.set_major_locator(locator)
+                if _have_room(panel, ticks):
+                    break
 
 
 def _have_room(panel: Axes, ticks: Sequence[float]) -> bool:
@@ -206,8 +212,10 @@ def _have_room(panel: Axes, ticks: Sequence[float]) -> bool:
 
 
 def _ticks(panel: Axes, locator: LogLocator) -> list[float]:
+    """Ticks in sight that are of the locator's multiples; it has others where these are fewer than two."""
     low, high = panel.get_xlim()
-    return [v for v in locator.tick_values(low, high) if low <= v <= high]
+    values = [v for v in locator.tick_values(low, high) if low <= v <= high]
+    return [v for v in values if np.isclose(v / 10 ** math.floor(math.log10(v) + 1e-9), locator._subs).any()]
 
 
 def stage_colors(stages) -> list[str]:
@@ -227,8 +235,9 @@ def fingerprint(fig: Figure) -> str:
         content += [panel.get_xscale(), panel.get_yscale(), _rounded([*panel.get_xlim(), *panel.get_ylim()])]
         content += [panel.get_title(loc) for loc in ("left", "center")]
         content += [panel.get_xlabel(), panel.get_ylabel(), *(text.get_text() for text in panel.texts)]
-        fixed = [axis.get_major_formatter() for axis in (panel.xaxis, panel.yaxis)]
-        content += [list(one.seq) for one in fixed if isinstance(one, FixedFormatter)]
+        for axis in (panel.xaxis, panel.yaxis):
+            if isinstance(ticks := axis.get_major_locator(), FixedLocator):
+                content.append(axis.get_major_formatter().format_ticks(ticks()))
         for line in panel.lines:
             style = (line.get_color(), line.get_marker(), line.get_linestyle(), line.get_linewidth())
             content.append([_rounded(line.get_xydata()), list(map(str, style)), line.get_label()])

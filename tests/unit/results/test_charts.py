@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from made import STAGES, Made, frame
 
-from nsf.results import table
+from nsf.results import style, table
 from nsf.results.charts import CHARTS, View, cases, errors
 from nsf.results.charts import view as register
 
@@ -97,3 +97,22 @@ def test_a_chart_is_added_by_one_function(monkeypatch):
 def test_lost_runs_are_no_colour_of_a_map():
     assert cases._summary(pd.Series([0.1, np.inf])) == "1 of 2 lost"
     assert cases._summary(pd.Series([0.1, 0.3])) == "mean 20 %"
+
+
+def test_a_name_beside_an_axis_is_part_of_a_chart():
+    one, other = (style.figure(2.0) for _ in range(2))
+    for fig, name in ((one, "recurrence"), (other, "projected")):
+        fig.subplots().set_yticks([0, 1], [name, "gru"])
+    assert style.fingerprint(one) != style.fingerprint(other)
+
+
+def test_ticks_of_a_narrow_logarithmic_axis_stay_apart(tmp_path):
+    with style.styled():
+        fig = style.figure(1.6)
+        panel = fig.subplots(1, 5)[0]
+        panel.plot([3900.0, 8100.0], [0.0, 1.0])
+        panel.set_xscale("log")
+        style.plain_ticks(panel.xaxis)
+        style.save(fig, tmp_path, "narrow", ("png",))
+    low, high = panel.get_xlim()
+    assert [tick for tick in panel.get_xticks() if low <= tick <= high] == [4000.0, 8000.0]
