@@ -63,11 +63,6 @@ class Rollout:
     by: str = ""
     stress: np.ndarray | None = None
 
-    @property
-    def handed_over(self) -> int:
-        """0 where the full-order solver took the run; −1 where it did not."""
-        return 0 if self.by == FULL_ORDER else -1
-
     def save(self, path: Path) -> None:
         """Write as HDF5, whole or not at all."""
         # In memory first: HDF5 cannot report a full disk when it closes a file.
