@@ -214,8 +214,9 @@ class Pipeline(Configured):
 
     @property
     def inputs(self) -> list[Run]:
-        """The runs from which the chain makes others: trajectories, the manifold, and the taught model."""
-        return [run for stage in ("simulate", "train", "teach") for run in self.runs_of(stage)]
+        """The runs from which the chain makes others: trajectories, the manifold, encoded runs, a fit."""
+        runs = [run for stage in ("simulate", "train", "teach") for run in self.runs_of(stage)]
+        return [*runs, self.encoding] if self.is_taught else runs
 
     def evaluated(self, stage: str = "evaluate") -> Run:
         """The complete run of a stage, of this device or another: it may have been brought here.

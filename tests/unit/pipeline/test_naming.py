@@ -72,3 +72,8 @@ def test_a_scene_survives_the_way_through_a_configuration(name):
     c = config.load([f"scene={name}", "scale=small", "device=cpu"])
     scene = scene_of(c)
     assert plain_scene(scene_of(config_of(scene))) == plain_scene(scene)
+
+
+def test_encoded_runs_are_among_what_a_sweep_needs():
+    pipeline = Pipeline(config.load(["scene=tray", "scale=small", "device=cpu", "model=recurrence"]))
+    assert {pipeline.encoding, pipeline.taught} <= set(pipeline.inputs)
