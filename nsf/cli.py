@@ -199,13 +199,19 @@ def _index(arguments: list[str]) -> int:
 
 def _init(arguments: list[str]) -> int:
     """A project of the user."""
-    if len(arguments) != 1 or arguments[0].startswith("-"):
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
         raise ConfigError("nsf init needs one folder, as nsf init my_project")
-    from nsf.init import write_project
-
     folder = Path(arguments[0])
-    write_project(folder)
-    print(f"wrote {folder}; next: cd {folder}, pip install -e . and nsf run --config-dir conf scene=bracket")
+    options = words.values("init", arguments[1:], dict.fromkeys(("mesh", "unit", "up"), words.text))
+    if options and "mesh" not in options:
+        raise ConfigError("unit= and up= are of a mesh; give it as mesh=FILE")
+    from nsf.init import write_project
+    from nsf.scenes import Mesh
+
+    mesh = Mesh(options["mesh"], unit=options.get("unit", ""), up=options.get("up", "z")) if options else None
+    name = write_project(folder, mesh)
+    scene = name if mesh else "bracket"
+    print(f"wrote {folder}; next: cd {folder}, pip install -e . and nsf run --config-dir conf scene={scene}")
     return 0
 
 

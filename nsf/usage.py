@@ -49,7 +49,7 @@ TOOLS = {
     ),
     "init": (
         "a project of yours: a law, a scene with a mesh, an experiment and a test, outside nsf's tree",
-        "FOLDER; which is new or empty",
+        "FOLDER [mesh=FILE unit=m|cm|mm [up=z]]; a new or empty folder, whose scene is scaled to your mesh",
     ),
     "runs": ("every run there is: listed, shown, compared, verified, deleted", None),
     "index": (
