@@ -3,6 +3,7 @@
 import importlib
 import importlib.metadata
 import os
+import pkgutil
 import platform
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -111,14 +112,22 @@ def _extras() -> Iterator[str]:
 
 
 def _packages() -> Iterator[str]:
-    """Each entry point of the group `nsf`, and whether its module can be imported."""
+    """Each entry point of the group `nsf`, and which of its modules cannot be imported."""
     for point in entry_points():
-        try:
-            importlib.import_module(point.module)
-            state = "there"
-        except Exception as error:
-            state = f"cannot be imported, {type(error).__name__}: {first_line(error)}"
+        state = "; ".join(_broken(point.module)) or "there"
         yield f"{point.name:<10} {point.module} of {point.dist.name} {point.dist.version}: {state}"
+
+
+def _broken(module: str) -> Iterator[str]:
+    """Modules that cannot be imported, among one and those inside it, each with its error."""
+    try:
+        package = importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        yield f"{module} cannot be imported, {type(error).__name__}: {first_line(error)}"
+        return
+    for inner in pkgutil.iter_modules(getattr(package, "__path__", ()), f"{module}."):
+        if not inner.name.endswith(".__main__"):  # which runs, where it is imported
+            yield from _broken(inner.name)
 
 
 def _fits(requirement) -> bool:

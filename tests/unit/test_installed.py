@@ -50,7 +50,14 @@ def test_a_class_of_an_entry_point_is_built():
     assert config.build(LAW, "material").factor == 2.0
     assert code.arguments("mine.laws.Stiff") == {"E": "float", "nu": "float", "factor": "float"}
     assert "mine       mine.laws of mine 1.0: there" in doctor.report()
-    assert "broken of mine 1.0: cannot be imported, ModuleNotFoundError" in doctor.report()
+    assert "broken of mine 1.0: broken cannot be imported, ModuleNotFoundError" in doctor.report()
+
+
+def test_a_broken_module_of_a_package_is_named(folder):
+    (folder / "mine/laws/torn.py").write_text("from .core import OTHER\n")
+    (folder / "mine/laws/__main__.py").write_text("raise RuntimeError('run')\n")
+    assert "mine.laws of mine 1.0: mine.laws.torn cannot be imported, ImportError: " in doctor.report()
+    assert "RuntimeError" not in doctor.report()
 
 
 @pytest.mark.usefixtures("folder")
