@@ -121,7 +121,7 @@ def expected(stage: str, runs: dict[Run, Pipeline]) -> Expected:
 def scene_table(pipeline: Pipeline) -> Table:
     """Particles, grid, resolution and step of a scene, and its cases."""
     from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
-    from nsf.scenes.resolution import thinnest
+    from nsf.scenes.resolution import resolution_warnings, thinnest
 
     scene = pipeline.scene
     case = pipeline.split.cases[0]
@@ -148,9 +148,11 @@ def scene_table(pipeline: Pipeline) -> Table:
     rows["memory"] = _memory(pipeline)
     c = pipeline.config
     rows["deployed"] = f"on {pipeline.device}, model {pipeline.configured.name}, r {c.latent_dim}"
-    if line := multiplied_step_warning(c.deploy.dt_multiplier, scene.dt, stable):
-        rows["warning"] = line
-    for key, value in rows.items():
+    warnings = [
+        *resolution_warnings(at),
+        multiplied_step_warning(c.deploy.dt_multiplier, scene.dt, stable),
+    ]
+    for key, value in [*rows.items(), *(("warning", line) for line in warnings if line)]:
         table.add_row(key, escape(value))
     return table
 

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
+from rich.markup import escape
 
 from nsf import progress
 from nsf.cli import main
@@ -13,6 +14,7 @@ from nsf.errors import SchemaError
 from nsf.pipeline import Pipeline, preview
 from nsf.pipeline.outcome import outcome_table
 from nsf.progress import Progress, label, labelled
+from nsf.scenes.resolution import resolution_warnings
 
 
 @pytest.fixture
@@ -73,6 +75,13 @@ def test_a_scene_of_a_chain_that_is_there():
     pipeline = Pipeline(load(["scene=cake", "scale=small", "device=cpu"]))  # as of a chain that is there
     shown = preview.scene_table(pipeline)
     assert "12,500" in list(shown.columns[1].cells)
+
+
+def test_a_coarse_scene_is_warned_of_as_in_a_run():
+    pipeline = Pipeline(load(["scene=sand", "device=cpu", "scene.bodies.column.particles=300"]))
+    shown = preview.scene_table(pipeline)
+    rows = dict(zip(*(list(column.cells) for column in shown.columns), strict=True))
+    assert rows["warning"] == escape(resolution_warnings(pipeline.scene)[0])
 
 
 def test_trajectories_take_what_their_bytes_say(chain, tiny, monkeypatch):
