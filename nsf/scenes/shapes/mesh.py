@@ -145,7 +145,9 @@ def _read(path: str) -> bytes:
             f"mesh={path}: extension {file.suffix!r} is not supported; export it as {', '.join(EXTENSIONS)}"
         )
     if not file.is_file():
-        raise ConfigError(f"mesh={path} is no file; relative paths start from {Path.cwd()}")
+        raise ConfigError(
+            f"mesh path={path} is no file; a relative path is read from the current folder, {Path.cwd()}"
+        )
     try:
         size = file.stat().st_size
         if size > _MAX_BYTES:

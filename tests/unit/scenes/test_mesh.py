@@ -399,7 +399,7 @@ class TestDrop:
             load_scene("drop", [f"scene.geometry.mesh={path}", "scene.geometry.height=0.9"])
 
     def test_missing_mesh(self):
-        with pytest.raises(ConfigError, match=r"mesh=bunny\.obj is no file"):
+        with pytest.raises(ConfigError, match=r"mesh path=bunny\.obj is no file"):
             load_scene("drop", ["scene.geometry.mesh=bunny.obj"])
 
 
