@@ -38,6 +38,7 @@ def test_a_good_model_is_green_and_its_bound_holds(rows, model):
     assert (table["error_bound"] >= table["displacement_error"]).all()
     assert (table["error_bound"] <= 5.0 * table["displacement_error"]).all()
     assert any(line.startswith("deploy: friction_angle=26°: green: error ") for line in said)
+    assert sum("2 validation runs set the error bounds" in line for line in said) == 1
     assert pipeline.validating.deployment.id in pipeline.deployment.parents
     trust = Trust.open(pipeline.deployment.file(TRUST), pipeline.manifold())
     assert trust.calibration.errors.shape == (2,)

@@ -22,6 +22,7 @@ from nsf.deployment import (
     deploy,
     rollout_file,
 )
+from nsf.deployment.bound import ENOUGH, widening
 from nsf.deployment.trust import percent
 from nsf.dynamics import ReducedBatch
 from nsf.kinematics.manifold import Manifold
@@ -51,6 +52,12 @@ def deploy_held_out(pipeline, run: Run) -> None:
         trust = calibrated(pipeline, manifold)
         trust.save(record.path / TRUST)
         record.output(TRUST)
+        runs = len(trust.calibration.errors) if trust.calibration else 0
+        if 0 < runs < ENOUGH:
+            pipeline.say(
+                f"deploy: {runs} validation run{'s' * (runs > 1)} set the error bounds, which are "
+                f"{widening(runs):.2g} times as wide as of {ENOUGH}; add cases to scene.design.validation"
+            )
         if isinstance(pipeline.model, FullOrder):
             record.metrics |= {"engine": "full", "engine_why": "", "batch": 1}
             rollouts = _full_order(pipeline, manifold, pipeline.held_out, trust.limit)
