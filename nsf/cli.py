@@ -210,8 +210,8 @@ def _init(arguments: list[str]) -> int:
 
     mesh = Mesh(options["mesh"], unit=options.get("unit", ""), up=options.get("up", "z")) if options else None
     name = write_project(folder, mesh)
-    scene = name if mesh else "bracket"
-    print(f"wrote {folder}; next: cd {folder}, pip install -e . and nsf run --config-dir conf scene={scene}")
+    run = f"nsf run --config-dir conf scene={name if mesh else 'bracket'}"
+    print(f"wrote {folder}; next: cd {folder}, pip install -e '.[test]', {run}")
     return 0
 
 
