@@ -22,7 +22,7 @@ LEVEL = 0.9
 #: reports. Where validation runs are too few for a quantile it says how much wider a bound has to be.
 SCATTER = 0.5
 #: Validation runs, at least, whose quantile needs no assumption on how errors scatter.
-ENOUGH = math.ceil(LEVEL / (1.0 - LEVEL))
+ENOUGH = math.ceil(LEVEL / (1.0 - LEVEL) - 1e-9)
 _FACTORS = ("factor", "typical")
 GREEN, AMBER, RED, UNKNOWN = FLAGS = ("green", "amber", "red", "unknown")
 

@@ -22,6 +22,7 @@ def calibration(shares, signals, displacement=2.0, shape=RAMP):
 def test_one_score_is_widened_by_the_quantile_of_a_difference():
     """log(e/e_1) of two log-normal errors has √2 times their deviation, and 1.2816 of it as 90 % quantile."""
     assert widening(1) == pytest.approx(np.exp(1.2816 * np.sqrt(2.0) * SCATTER), rel=1e-3)
+    assert ENOUGH == 9
     assert [widening(n) for n in (ENOUGH, 50)] == [1.0, 1.0]
     assert list(np.argsort([-widening(n) for n in range(1, ENOUGH)])) == list(range(ENOUGH - 1))
 
