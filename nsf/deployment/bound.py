@@ -13,6 +13,7 @@ Source: Lei et al. 2018, Distribution-free predictive inference for regression (
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 
 import numpy as np
 
@@ -27,6 +28,7 @@ _FACTORS = ("factor", "typical")
 GREEN, AMBER, RED, UNKNOWN = FLAGS = ("green", "amber", "red", "unknown")
 
 
+@cache
 def widening(runs: int) -> float:
     """Factor on the largest of a number of scores that a further one exceeds in 1 − `LEVEL` of all cases.
 
