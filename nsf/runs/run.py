@@ -114,7 +114,7 @@ class Run:
 
         Args:
             name: the run's folder, or as much of the beginning of its id, of `scene/hash` or of its hash as
-                no other run shares.
+                no other run shares, but for one of its stage that it was made from.
             stage: such as "deploy"; None for any.
             root: folder of all runs, for a name that is no folder; NSF_RUNS, else ./runs.
 
@@ -132,6 +132,9 @@ class Run:
             for run in recorded
             if any(n.startswith(beginning) for n in (run.id, f"{run.scene}/{run.hash}", run.hash))
         ]
+        # A deployment's error bound is calibrated by another one, which is not meant.
+        calibrating = {parent for run in fit for parent in run.parents if parent.startswith(f"{run.stage}/")}
+        fit = [run for run in fit if run.id not in calibrating]
         if len(fit) != 1:
             kind = f"{stage} run" if stage else "run"
             what = f"{len(fit)} {kind}s begin with" if fit else f"no {kind} is, or begins with,"

@@ -293,6 +293,7 @@ def test_a_stage_before_its_time_names_the_command(nsf, tmp_path, stage, needed)
 
 def test_runs_are_listed_and_compared(nsf, chain, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(chain.root))
+    monkeypatch.setenv("COLUMNS", "160")
     code, out, _ = nsf("runs", "stage=evaluate", "scene=sand", "latent_dim=4", tiny_scene=False)
     assert code == 0
     assert chain.pipeline.evaluation.hash in out

@@ -248,7 +248,7 @@ def reduced(chain, pipeline_at):
     found, said = measurements("fp32", "fp64")
     few_cells = ("sampler=cells", "sampler.size=9", "sampler.cells=2", "sampler.states=4")
     measured_chain({"": pipeline_at(chain.root), "_cells": pipeline_at(chain.root, *few_cells)}, found)
-    assert len(said) == 12
+    assert len([line for line in said if not line.startswith("warning")]) == 12
     return found.frame
 
 
