@@ -32,7 +32,7 @@ from nsf.results.style import (
 
 COLORS = "viridis"
 """Colour scale of the maps of errors."""
-_FEWEST = 6  # cases of which means of neighbours say anything
+_FEWEST = 12  # cases of which means of neighbours say anything
 _CROSS = {"ls": "", "marker": "x", "ms": 4, "mew": 0.9, "color": "#aaaaaa"}
 _LOST = {"ls": "", "marker": "X", "ms": 8, "mec": "white", "mew": 0.8}
 _MAPS = 4  # in a row
@@ -40,9 +40,9 @@ _WIDEST = 28  # letters of a line above a map
 
 
 @chart(
-    "Displacement error of held-out cases over each parameter, a dot a case, its mean over seeds; a line is "
-    "the mean over neighbouring cases, its band from the smallest to the largest. Crosses above are lost: "
-    "they diverged or are off by more than 1,000 %."
+    "Displacement error of held-out cases over each parameter, a dot a case, its mean over seeds; of "
+    "twelve cases or more a line is the mean over neighbours, its band from the smallest to the largest. "
+    "Crosses above are lost: they diverged or are off by more than 1,000 %."
 )
 def error_over_parameters(view: View) -> Figures:
     """Errors over each parameter of each body, a panel each."""
