@@ -1,5 +1,6 @@
 """Words of a command, `key=value`, each read by what its key takes."""
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -61,8 +62,8 @@ def flag(key: str, value: str) -> bool:
 
 def number(key: str, value: str) -> float:
     """A decimal number."""
-    if not re.fullmatch(NUMBER, value):
-        raise ConfigError(f"{key}={value} is no number")
+    if not (re.fullmatch(NUMBER, value) and math.isfinite(float(value))):
+        raise ConfigError(f"{key}={value} is no number that a computer holds")
     return float(value)
 
 

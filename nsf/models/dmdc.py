@@ -13,6 +13,7 @@ from nsf.models.drawn import Drawn
 from nsf.models.inputs import Inputs, Lessons, Validation
 from nsf.models.latent import LatentModel
 from nsf.recurrence.engine import between
+from nsf.scalars import number
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,12 @@ class DMDc(Drawn, LatentModel):
 
     def __post_init__(self):
         super().__post_init__()
-        if not self.delays or min(self.delays) < 1 or not self.ridge or min(self.ridge) < 0:
-            raise ConfigError(
-                f"model.delays={list(self.delays)} must be at least 1, and model.ridge={list(self.ridge)} at "
-                "least 0; give one of each, or several"
-            )
+        for name, least in (("delays", 1), ("ridge", 0)):
+            values = getattr(self, name)
+            if not isinstance(values, list | tuple) or not values:
+                raise ConfigError(f"model.{name}={values} must be a list of numbers, as [{least}]")
+            for value in values:
+                number(f"model.{name}", value, least, whole=name == "delays")
 
     @override
     def fit(self, manifold, lessons: Lessons, validation: Validation | None, seed: int) -> dict[str, Any]:

@@ -159,9 +159,9 @@ def _deviation(values: Tensor) -> Tensor:
 
 
 def _spread(values: Tensor) -> Tensor:
-    """Deviation [n] of rows, 1 where there is none."""
+    """Deviation [n] of rows, 1 where there is none but for round-off."""
     deviation = values.std(0, correction=0)
-    return torch.where(deviation > 0, deviation, 1.0)
+    return torch.where(deviation > 1e-9 * values.abs().amax(0), deviation, 1.0)
 
 
 def _gravity_scale(gravity: Tensor) -> Tensor:

@@ -182,5 +182,5 @@ def test_models_that_learn_share_encoded_runs(copied, pipeline_at):
     assert sum(line.startswith("encode: inputs unchanged") for line in said) == 1
     with pytest.raises(ConfigError, match=r"model=dmdc takes strides .* set it to 1, and model.stride"):
         pipeline_at(root, "model=dmdc", "deploy.dt_multiplier=1.5")
-    with pytest.raises(ConfigError, match=r"model.delays=\[0\] must be at least 1"):
+    with pytest.raises(ConfigError, match=r"model\.delays=0 must be a whole number of at least 1"):
         pipeline_at(root, "model=dmdc", "model.delays=[0]")

@@ -106,6 +106,7 @@ def encoded_runs(pipeline, manifold: Manifold) -> Lessons:
     Raises:
         MissingRunError: they are not there.
         SchemaError: a file was changed after its run.
+        InstabilityError: none is whole.
     """
     run = pipeline.encoding.require()
     there = {output["path"] for output in run.manifest["outputs"]}
@@ -114,7 +115,12 @@ def encoded_runs(pipeline, manifold: Manifold) -> Lessons:
         for index, lesson in enumerate(lessons_of(pipeline))
         if _file(index) in there
     ]
-    return joined(manifold, [(lesson, one) for lesson, one in pairs if one.finite])
+    whole = [(lesson, one) for lesson, one in pairs if one.finite]
+    if not whole:
+        raise InstabilityError(
+            f"none of {len(pairs)} encoded runs is finite; set a smaller scene.dt, or a smaller latent_dim"
+        )
+    return joined(manifold, whole)
 
 
 def encoded_validation(pipeline, manifold: Manifold) -> Lessons:

@@ -302,7 +302,7 @@ def test_training_is_timed_from_its_files(chain):
     (row,) = found.rows
     assert (row["case"], row["what"], row["particles"]) == ("training_sand", "training", 500)
     assert row["p10"] < row["median"] < row["p90"]
-    assert len(said) == 2
+    assert len([line for line in said if not line.startswith("warning")]) == 2
 
 
 # -- sizes ----------------------------------------------------------------------------------------------
@@ -363,7 +363,7 @@ def batches(chain):
     """Rows of batches of the tiny chain."""
     found, said = measurements("fp32", "fp64")
     measured_batches(again(chain), (1, 3, 2), found)
-    assert len(said) == 6
+    assert len([line for line in said if not line.startswith("warning")]) == 6
     return found.frame
 
 

@@ -1,10 +1,13 @@
 """A linear system and a recurrent network, fitted to oscillators under a gravity that wanders."""
 
+import math
+import re
+
 import numpy as np
 import pytest
 import torch
 
-from nsf.errors import InstabilityError
+from nsf.errors import ConfigError, InstabilityError
 from nsf.models.dmdc import DMDc
 from nsf.models.gru import GRU
 from nsf.models.inputs import Inputs, Lessons, Validation
@@ -61,3 +64,16 @@ def test_a_fit_that_is_lost_is_refused():
     lost = Validation(held_back.inputs, lambda xhat: np.nan, held_back.moves)
     with pytest.raises(InstabilityError, match=r"loses a validation run; raise model\.ridge"):
         DMDc("dmdc", stride=1).fit(Fields(), oscillators(), lost, 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "quoted"),
+    [
+        ({"delays": 3}, "model.delays=3 must be a list of numbers"),
+        ({"delays": [2.5]}, "model.delays=2.5 must be a whole number"),
+        ({"ridge": [math.nan]}, "model.ridge=nan must be a finite number"),
+    ],
+)
+def test_values_that_no_fit_can_use_are_refused(options, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        DMDc("dmdc", **options)

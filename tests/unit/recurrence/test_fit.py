@@ -175,3 +175,8 @@ def test_the_loss_of_a_window_is_that_of_the_form_in_units():
     torch.testing.assert_close(
         descent._loss(window, k, n, *noise).double(), (expected + 0.3 * single).sum(), rtol=1e-4, atol=0.0
     )
+
+
+def test_a_parameter_that_never_varies_has_no_scale():
+    runs = replace(damped(count=7), parameters=torch.full((7, 1), 0.1, dtype=torch.float64))
+    assert float(standardised(runs, SHORT, 0.01, 1, True, 0).mu_scale) == 1.0
