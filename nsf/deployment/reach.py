@@ -42,7 +42,8 @@ class Band:
     def of_states(cls, rows: np.ndarray, others: Sequence[np.ndarray]) -> "Band":
         """Of latent states [K, r] [m] of training runs; others: [N, r] of validation runs."""
         one = cls(rows.min(0), rows.max(0), 0.0)
-        beyond = max((float(np.max(one.together(states))) for states in others), default=0.0)
+        farthest = [float(np.max(one.together(states), initial=0.0)) for states in others]
+        beyond = max((far for far in farthest if np.isfinite(far)), default=0.0)  # a lost run widens nothing
         return cls(one.low, one.high, float(np.clip(_AGAIN * beyond, _LEAST, _MOST)))
 
     def each(self, rows: np.ndarray) -> np.ndarray:

@@ -187,3 +187,9 @@ def test_what_is_no_trust_file(tmp_path, change):
     (tmp_path / "trust.json").write_text(json.dumps(calibrated().plain | change))
     with pytest.raises(SchemaError, match="deploy again"):
         Trust.open(tmp_path / "trust.json", Trained)
+
+
+def test_a_lost_validation_run_widens_no_range():
+    lost = LATENTS.copy()
+    lost[-1] = np.nan
+    assert Band.of_states(LATENTS, [lost]).leeway == Band.of_states(LATENTS, []).leeway
