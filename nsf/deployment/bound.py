@@ -71,10 +71,11 @@ def flag_of(bound: float, limit: float) -> str:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What runs of validation cases say on the error of a new one.
+    """Errors of validation runs, from which that of a new one is bounded.
 
     Attributes:
-        t: [F] times [s]; curve: [F] the best of their errors over time, as a share of a run's displacement.
+        t: [F] times [s]; curve: [F] their mean shape over time, as large as the best of
+            them, as a share of a run's displacement.
         slope: median of error over signal [-].
         factor: on the larger of both, for a bound; typical: likewise, for the error in the middle.
         displacement: RMS over runs [m]; errors: [n] of each run, shares of its displacement.

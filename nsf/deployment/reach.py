@@ -1,4 +1,4 @@
-"""What the runs cover that a model was trained and taught on: outside of it no bound is promised."""
+"""Ranges of parameters, forcing and states in training and teaching; outside of them no bound holds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

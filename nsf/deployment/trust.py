@@ -132,10 +132,12 @@ class Trust:
     Args:
         metric: [r, r] of latent vectors (`metric_of`).
         taught: [K, r] latent vectors of training.
-        reach: what was taught; None: nothing is known of it.
+        reach: what was taught; None where it is not known: such a one cannot be written.
         calibration: of validation runs; None where there are none.
         validated: [n, p] parameters of their cases.
         limit: share of the displacement above which a run is not believed.
+
+    Attributes:
         unknown: why nothing is told, where nothing is.
     """
 
@@ -205,7 +207,7 @@ class Trust:
     def signal(
         self, xhat: np.ndarray, members: np.ndarray | None = None, residuals: np.ndarray | None = None
     ) -> np.ndarray:
-        """What a run says of its error [N + 1] [m]; ∞ where it is lost.
+        """How far off a run says of itself to be [N + 1] [m]; ∞ where it is lost.
 
         Args:
             xhat: [N + 1, r] latent vectors.

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -42,8 +42,7 @@ class Span(ABC):
     Attributes:
         batch, sets, at_sample: the arguments; record: the batch's.
         s: |S|; size: particles of each run that a step may need.
-        latent_only: whether a step goes from x̂ to x̂ without particles. Then `take` takes many at once,
-            nothing is projected, and `enter` is called once, not for each span.
+        latent_only: whether it is a `LatentOnlySpan`.
         capturable: whether a step is the same launches each time; graph: of a step, where it is captured.
     """
 
@@ -72,10 +71,6 @@ class Span(ABC):
             return torch.zeros(len(self.batch), latents, dtype=setup.dtype, device=setup.torch_device)
         changes = first_changes(self.at_sample, self.sets.sample, self.batch.setups)
         return (changes / setup.dt).to(setup.torch_device, setup.dtype)
-
-    def take(self, steps: int) -> None:
-        """Take steps at once, where they are `latent_only`."""
-        raise NotImplementedError(f"{type(self).__name__} takes its steps one by one")
 
     def members(self, steps: int) -> torch.Tensor | None:
         """x̂ [M, B, steps + 1, r] of each member of a model that has several, up to a step; None of others."""
@@ -151,3 +146,25 @@ class GridSpan(Span):
         arrays = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
         arrays += (self.C, self.tau)
         return super().nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in arrays)
+
+
+class LatentOnlySpan(Span):
+    """Steps from x̂ to x̂ without particles, many at once; nothing is projected.
+
+    `enter` is called once, not for each span.
+
+    Attributes:
+        stage: name of the one stage of a step.
+    """
+
+    latent_only = True
+    stage: ClassVar[str]
+
+    @property
+    @override
+    def stages(self) -> Stages:
+        return {self.stage: lambda: self.take(1)}
+
+    @abstractmethod
+    def take(self, steps: int) -> None:
+        """Take steps at once."""

@@ -208,7 +208,7 @@ class Model:
 
     @cached_property
     def trust(self) -> Trust:
-        """What bounds the errors of its runs, as its deployment calibrated it."""
+        """The bounds of its errors, as its deployment calibrated them."""
         return Trust.open(self.run.file(TRUST), self.manifold)
 
     def _of(self, name: str, mu: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing_extensions import override
 from nsf.data import Case
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.setup import Setup
-from nsf.dynamics.span import Span, Stages
+from nsf.dynamics.span import LatentOnlySpan, Span
 from nsf.engines.base import Engine
 from nsf.models.base import Model
 from nsf.models.inputs import Inputs, Lessons
@@ -108,19 +108,14 @@ class _Table:
         return self._xhat
 
 
-class LatentSpan(Span):
+class LatentSpan(LatentOnlySpan):
     """A span of time of such runs; S serves those who decode the sample particles."""
 
-    latent_only = True
+    stage = "latent"
 
     def __init__(self, batch: Batch, sets, at_sample, table: _Table):
         super().__init__(batch, sets, at_sample)
         self._table = table
-
-    @property
-    @override
-    def stages(self) -> Stages:
-        return {"latent": lambda: self.take(1)}
 
     @override
     def enter(self, first: bool) -> None:

@@ -30,7 +30,7 @@ def cores(device: str) -> int:
     """
     if device != "cpu":
         return 1
-    threads = os.environ.get("OMP_NUM_THREADS", "")
+    threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]  # "4,2" has those of each level
     return min(cpu_count(), int(threads)) if threads.isdigit() and int(threads) else cpu_count()
 
 

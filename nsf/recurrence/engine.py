@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.setup import Setup
-from nsf.dynamics.span import Span, Stages
+from nsf.dynamics.span import LatentOnlySpan, Span
 from nsf.engines.base import Engine
 from nsf.recurrence import taught as files
 from nsf.recurrence.descent import of_strides
@@ -208,7 +208,7 @@ def _linear(nodes: Tensor, stride: int) -> Tensor:
     return torch.cat([inside.flatten(-3, -2), nodes[..., -1:, :]], -2)
 
 
-class RecurrenceSpan(Span):
+class RecurrenceSpan(LatentOnlySpan):
     """A span of time of runs by a recurrence; S is there for what asks where the sample particles are.
 
     Args:
@@ -216,16 +216,11 @@ class RecurrenceSpan(Span):
         runs: where the runs are.
     """
 
-    latent_only = True
+    stage = "recurrence"
 
     def __init__(self, batch: Batch, sets, at_sample, runs: Runs):
         super().__init__(batch, sets, at_sample)
         self._runs = runs
-
-    @property
-    @override
-    def stages(self) -> Stages:
-        return {"recurrence": lambda: self.take(1)}
 
     @override
     def enter(self, first: bool) -> None:

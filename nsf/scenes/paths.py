@@ -29,7 +29,7 @@ def value_at(node: Any, parts: Sequence[str]) -> Any:
 
 
 def _inside(node: Any) -> dict[str, Any]:
-    """What a dataclass, a mapping or a list holds, by the part of a path that leads there."""
+    """Values of a dataclass, a mapping or a list, by the part of a path that leads there."""
     if is_dataclass(node):
         return {field.name: getattr(node, field.name) for field in fields(node)}
     if isinstance(node, Mapping):

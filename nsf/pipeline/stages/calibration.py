@@ -1,4 +1,4 @@
-"""What bounds the errors of a pipeline's runs: its runs of validation cases, held to their full-order runs.
+"""Calibrates error bounds: runs of validation cases, compared with their full-order runs.
 
 These runs are a deployment of their own, made once for a model and used again. They are compared at a few
 hundred particles and some fifty frames.
@@ -27,7 +27,7 @@ _PARTICLES, _FRAMES = 500, 51
 
 
 def calibrated(pipeline, manifold: Manifold) -> Trust:
-    """What bounds the errors of a pipeline's runs.
+    """The bounds of the errors of a pipeline's runs.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`, whose validation cases are deployed (`Pipeline.validating`).
@@ -85,7 +85,7 @@ def _at(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Reach:
-    """What was taught: parameters, forcing, and latent states of training runs, and of drawn ones."""
+    """Parameters, forcing and latent states of training runs, and of drawn ones."""
     scene = pipeline.scene
     latents = manifold.training_latents.double().cpu().numpy()
     runs, t = [scene.at(case) for case in pipeline.split.train], scene.dt * np.arange(scene.steps)
