@@ -83,13 +83,12 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """The light in words: `amber: error 7.1 %, at most 14 % of the displacement`."""
-        told = ""
+        """The light in words: `amber: expected error 7.1 %, at most 14 % of the displacement`."""
+        errors = ""
         if not np.isnan(self.bound_share):
-            told = (
-                f"error {percent(self.error_share)}, at most {percent(self.bound_share)} of the displacement"
-            )
-        return f"{self.flag}: " + "; ".join(part for part in (told, self.reason) if part)
+            expected, bound = percent(self.error_share), percent(self.bound_share)
+            errors = f"expected error {expected}, at most {bound} of the displacement"
+        return f"{self.flag}: " + "; ".join(part for part in (errors, self.reason) if part)
 
 
 def percent(share: float) -> str:

@@ -34,7 +34,7 @@ export function quantity(value, unit, digits = 3) {
 export function lightOf(error, bound, limit, reason, flag = null) {
   const level = flag ?? (Number.isNaN(bound) ? "unknown" : bound <= 0.5 * limit ? "green" : bound <= limit ? "amber" : "red");
   const percent = (/** @type {number} */ share) => (Number.isFinite(share) ? quantity(100 * share, "%") : "∞");
-  const errors = Number.isNaN(bound) ? "" : `error ${percent(error)}, at most ${percent(bound)} of the displacement`;
+  const errors = Number.isNaN(bound) ? "" : `expected error ${percent(error)}, at most ${percent(bound)} of the displacement`;
   return { level, text: `${level}: ${[errors, reason].filter(Boolean).join("; ")}` };
 }
 

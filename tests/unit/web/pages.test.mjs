@@ -238,10 +238,10 @@ function strided(apart, end = 0.5, gravity = [0, 0, -4]) {
 test("the light is the bound's, and names its reason", () => {
   // It moves by 0, 1 and 1 m: D² = 0.75 m². Members are 0.1 m apart: a signal of 0.1 / √2 m.
   const light = (made, parameters = [30], own = trust()) => own.light(made, parameters, 2, true);
-  assert.deepEqual(light(strided(0)), { level: "green", text: "green: error 1.73 %, at most 2.6 % of the displacement" });
+  assert.deepEqual(light(strided(0)), { level: "green", text: "green: expected error 1.73 %, at most 2.6 % of the displacement" });
   const apart = light(strided(0.1));
   assert.equal(apart.level, "red");
-  assert.match(apart.text, /error 16.3 %, at most 24.5 % of the displacement/);
+  assert.match(apart.text, /expected error 16.3 %, at most 24.5 % of the displacement/);
   assert.match(light(strided(0), [35]).text, /at most 2.92 %/); // a quarter of the box away from a validation case
   assert.equal(light(strided(0), [41]).text.split("; ")[1], "angle=41° is outside of 20 … 40");
   assert.match(light(strided(0, 0.5, [0, 1, -4])).text, /^red: .*gravity is 1 m\/s² from that which was taught, 0.5 m\/s² at most/);
