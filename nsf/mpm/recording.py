@@ -9,6 +9,7 @@ from functools import cache, partial
 import numpy as np
 import warp as wp
 
+from nsf.gpu import without_collection
 from nsf.mpm.precision import FP32, Precision
 from nsf.mpm.state import ParticleState
 
@@ -76,27 +77,33 @@ def _make_pack(precision: Precision, stored: Precision):
         C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33),
         order: wp.array(dtype=wp.int32),
-        frame_x: wp.array2d(dtype=out),
-        frame_v: wp.array2d(dtype=out),
-        frame_C: wp.array2d(dtype=out),
-        frame_tau: wp.array2d(dtype=out),
+        count: wp.array(dtype=wp.int32),
+        frames_x: wp.array3d(dtype=out),
+        frames_v: wp.array3d(dtype=out),
+        frames_C: wp.array3d(dtype=out),
+        frames_tau: wp.array3d(dtype=out),
     ):
         row = wp.tid()
-        p = order[row]
+        n, p = count[0], order[row]
         for a in range(3):
-            frame_x[p, a] = out(x[row][a])
-            frame_v[p, a] = out(v[row][a])
+            frames_x[n, p, a] = out(x[row][a])
+            frames_v[n, p, a] = out(v[row][a])
             for b in range(3):
-                frame_C[p, 3 * a + b] = out(C[row][a, b])
+                frames_C[n, p, 3 * a + b] = out(C[row][a, b])
         t = tau[row]
-        frame_tau[p, 0] = out(t[0, 0])
-        frame_tau[p, 1] = out(t[0, 1])
-        frame_tau[p, 2] = out(t[0, 2])
-        frame_tau[p, 3] = out(t[1, 1])
-        frame_tau[p, 4] = out(t[1, 2])
-        frame_tau[p, 5] = out(t[2, 2])
+        frames_tau[n, p, 0] = out(t[0, 0])
+        frames_tau[n, p, 1] = out(t[0, 1])
+        frames_tau[n, p, 2] = out(t[0, 2])
+        frames_tau[n, p, 3] = out(t[1, 1])
+        frames_tau[n, p, 4] = out(t[1, 2])
+        frames_tau[n, p, 5] = out(t[2, 2])
 
     return pack
+
+
+@wp.kernel(enable_backward=False)
+def _count_on(count: wp.array(dtype=wp.int32)):
+    count[0] = count[0] + 1
 
 
 def block_bytes(particles: int, stored: Precision) -> int:
@@ -111,7 +118,7 @@ def frame_bytes(particles: int, stored: Precision) -> int:
 
 
 class FrameRecorder:
-    """Collects frames of a state on its device.
+    """Collects frames of a state on its device; on a GPU by a graph, as a launch from Python outlasts a step.
 
     Args:
         state: the state to record.
@@ -142,6 +149,8 @@ class FrameRecorder:
             for name, c in COMPONENTS.items()
         }
         self._pack = _make_pack(precision, stored)
+        self._place = wp.zeros(1, dtype=wp.int32, device=self._device)  # of the next frame, for the kernel
+        self._graph = None
         self.count = 0
 
     @property
@@ -151,16 +160,26 @@ class FrameRecorder:
 
     def record(self) -> None:
         """Pack the current state as the next frame."""
-        s = self._state
-        outputs = [block[self.count] for block in self._block.values()]
-        inputs = [s.x.rows, s.v.rows, s.C.rows, s.tau.rows, s.order, *outputs]
-        wp.launch(self._pack, dim=len(s), inputs=inputs, device=self._device)
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+        else:
+            self._launch()  # uncaptured, so that both kernels are compiled and loaded
+            if self._device.is_cuda:
+                with without_collection(), wp.ScopedCapture(device=self._device) as capture:
+                    self._launch()
+                self._graph = capture.graph
         self.count += 1
+
+    def _launch(self) -> None:
+        s = self._state
+        inputs = [s.x.rows, s.v.rows, s.C.rows, s.tau.rows, s.order, self._place, *self._block.values()]
+        wp.launch(self._pack, dim=len(s), inputs=inputs, device=self._device)
+        wp.launch(_count_on, dim=1, inputs=[self._place], device=self._device)
 
     def on_device(self) -> dict[str, wp.array]:
         """The frames recorded since the last call, where they are; the next one writes over them."""
         wp.synchronize_device(self._device)
-        count, self.count = self.count, 0
+        count = self._begin()
         return {name: block[:count] for name, block in self._block.items()}
 
     def take(self) -> Block:
@@ -169,9 +188,15 @@ class FrameRecorder:
         for name, block in self._block.items():
             wp.copy(memory[name], block, count=count * block[0].size)
         wp.synchronize_device(self._device)
-        self.count = 0
+        self._begin()
         fields = {name: values.numpy()[:count] for name, values in memory.items()}
         return Block(fields, partial(self._memory.give_back, memory))
+
+    def _begin(self) -> int:
+        """Begin at the first frame again; how many there were."""
+        count, self.count = self.count, 0
+        self._place.zero_()
+        return count
 
 
 def blocks(
