@@ -42,9 +42,8 @@ warnings.filterwarnings(
     "ignore", message=r"\s*'hydra/launcher/joblib' is validated against ConfigStore schema"
 )
 
-#: How jobs of a sweep are launched, unless told otherwise: without files of Hydra's own, loggers left alone.
+#: Of Hydra's launchers: no files of Hydra's, and loggers left alone.
 _SWEEP = (
-    "hydra/launcher=serial",
     "hydra/job_logging=none",
     "hydra/hydra_logging=none",
     "hydra.output_subdir=null",

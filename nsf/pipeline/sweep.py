@@ -11,6 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 
 from hydra._internal.callbacks import Callbacks
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
@@ -85,7 +86,8 @@ def sweep(
     Args:
         sweeps: overrides whose keys may have several values, without Hydra's own.
         stages: as of `work`.
-        launcher: Hydra's overrides, as `hydra/launcher=slurm`; one job after the other by default.
+        launcher: Hydra's overrides, as `hydra/launcher=slurm`; one job after the other by default, without
+            Hydra's launchers, which compose each job anew.
         config_name: the primary file in `conf/`.
         say: told where the logs of jobs are that run elsewhere.
 
@@ -97,14 +99,8 @@ def sweep(
         MissingExtraError: the launcher is not installed.
         LaunchError: no job could be started.
     """
-    config, loader = configuration.launching(launcher, config_name)
-    plugin = ".".join(config.hydra.launcher._target_.split(".")[:2])
-    if not plugin.startswith(("hydra_plugins.", "hydra._internal")):
-        raise ConfigError(
-            f"hydra.launcher._target_={config.hydra.launcher._target_} is refused; "
-            "choose a launcher, as hydra/launcher=joblib"
-        )
-    optional(plugin, "sweep")
+    launching = configuration.launching(launcher, config_name) if launcher else None
+    plugin = _plugin(launching[0]) if launching else ""
     movable: list[bool] = []  # by configuration: whether it may see any one GPU
     kept: set[str] = set()  # data.keep of all
     needed: set[Run] = set()
@@ -121,22 +117,21 @@ def sweep(
     for overrides in sweeps:
         configuration.check_sweep(overrides, config_name, check)
     jobs = configuration.jobs(sweeps, config_name)
-    context = HydraContext(config_loader=loader, callbacks=Callbacks())
     common = set.intersection(*map(set, jobs))
-    # Jobs side by side write into one terminal, or one log.
-    apart = "joblib" in plugin or "submitit" in plugin
-    labels = tuple(" ".join(o for o in job if o not in common) for job in jobs) if apart else ()
-    task = partial(_job, stages=tuple(stages), labels=labels)
     gpus = visible_gpus() if "joblib" in plugin and all(movable) else ()
-    if len(gpus) > 1:
-        task = partial(_on_a_gpu, task, gpus)
-    started = Plugins.instance().instantiate_launcher(context, task, config)
+    start = partial(_in_turn, stages, config_name)
+    if launching:
+        # Jobs side by side write into one terminal, or one log.
+        apart = "joblib" in plugin or "submitit" in plugin
+        labels = tuple(" ".join(o for o in job if o not in common) for job in jobs) if apart else ()
+        task = partial(_job, stages=tuple(stages), labels=labels)
+        start = partial(_launched, _launcher(launching, task, gpus), say)
     dropped = kept == {"held_out"} and {"train", "evaluate"} <= set(stages)
     errors: list[str | None] = []
     with reserving(needed), _own_processes() if len(gpus) > 1 else nullcontext():
         for scene in _scenes(jobs) if dropped else [jobs]:
             try:
-                ended = _launched(started, [list(job) for job in scene], say, len(errors))
+                ended = start([list(job) for job in scene], len(errors))
             except LaunchError as error:
                 if not errors:
                     raise
@@ -222,7 +217,7 @@ def _see_one_gpu(gpus: tuple[str, ...]) -> None:
 
 
 def _job(config: DictConfig, stages: Sequence[str], labels: Sequence[str] = ()) -> str | None:
-    """One job, in a process of its own or not. The error goes back as text, which every process can read.
+    """The error of one job that Hydra launched, in a process of its own or not, as `_ended` has it.
 
     Args:
         config: of the job.
@@ -230,16 +225,29 @@ def _job(config: DictConfig, stages: Sequence[str], labels: Sequence[str] = ()) 
         labels: by the number of a job, what each of its lines begins with; none where jobs come one by one.
     """
     guard()  # in a process of its own as well
-    with labelled(labels[HydraConfig.get().job.num] if labels else ""):
-        _say(f"--- {' '.join(HydraConfig.get().overrides.task)}")
-        try:
-            work(configuration.checked(config), stages, _say)
-        except NSFError as error:
-            print(f"{label()}error: {error}", file=sys.stderr, flush=True)
-            return str(error)
-        except Exception as error:
-            traceback.print_exc()
-            return f"{type(error).__name__}: {error}"
+    hydra = HydraConfig.get()
+    with labelled(labels[hydra.job.num] if labels else ""):
+        return _ended(hydra.overrides.task, lambda: configuration.checked(config), stages)
+
+
+def _in_turn(
+    stages: Sequence[str], config_name: str, jobs: Sequence[list[str]], _first: int
+) -> list[str | None]:
+    """The error of each job, done in this process one after the other."""
+    return [_ended(job, partial(configuration.load, job, config_name), stages) for job in jobs]
+
+
+def _ended(job: Sequence[str], compose: Callable[[], DictConfig], stages: Sequence[str]) -> str | None:
+    """The error of a job, None where it ended well; as text, which every process can read."""
+    _say(f"--- {' '.join(job)}")
+    try:
+        work(compose(), stages, _say)
+    except NSFError as error:
+        print(f"{label()}error: {error}", file=sys.stderr, flush=True)
+        return str(error)
+    except Exception as error:
+        traceback.print_exc()
+        return f"{type(error).__name__}: {error}"
     return None
 
 
@@ -270,8 +278,37 @@ def _drop_training(pipelines: Sequence[Pipeline], say: Callable[[str], object]) 
             say(f"warning: the trajectory of {run.id} stays: {error}")
 
 
+def _plugin(config: DictConfig) -> str:
+    """The package of the launcher of a configuration, which is installed.
+
+    Raises:
+        ConfigError: the configuration names something else.
+        MissingExtraError: it is not installed.
+    """
+    target = config.hydra.launcher._target_
+    plugin = ".".join(target.split(".")[:2])
+    if not plugin.startswith(("hydra_plugins.", "hydra._internal")):
+        raise ConfigError(
+            f"hydra.launcher._target_={target} is refused; choose a launcher, as hydra/launcher=joblib"
+        )
+    optional(plugin, "sweep")
+    return plugin
+
+
+def _launcher(
+    launching: tuple[DictConfig, ConfigLoader],
+    task: Callable[[DictConfig], str | None],
+    gpus: tuple[str, ...],
+) -> Launcher:
+    """Hydra's launcher of a task, each process on one GPU where there are several."""
+    config, loader = launching
+    context = HydraContext(config_loader=loader, callbacks=Callbacks())
+    task = partial(_on_a_gpu, task, gpus) if len(gpus) > 1 else task
+    return Plugins.instance().instantiate_launcher(context, task, config)
+
+
 def _launched(
-    launcher: Launcher, jobs: list[list[str]], say: Callable[[str], object], first: int = 0
+    launcher: Launcher, say: Callable[[str], object], jobs: list[list[str]], first: int
 ) -> list[str | None]:
     """The error of each job, None for one that ended well; `first` is the number of the first one."""
     kind, logs = type(launcher).__name__, Path()

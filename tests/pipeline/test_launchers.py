@@ -61,31 +61,25 @@ def test_an_array_that_slurm_refuses_has_no_results_of_an_earlier_one(tmp_path):
             raise RuntimeError("sbatch: error: Batch job submission failed")
 
     with pytest.raises(LaunchError, match="submission failed"):
-        module._launched(SlurmLauncher(), [["scene=sand"]], print, 1)
+        module._launched(SlurmLauncher(), print, [["scene=sand"]], 1)
 
 
-def says_its_gpu(config, stages, folder, beside, labels=()):
+def says_its_gpu(config, stages, folder, labels=()):
     (folder / f"{config.seed}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
     # The first job ends only once the other process has begun one, so that neither takes them all.
     began = time.monotonic()
-    while beside and len(list(folder.glob("[123]"))) < 2 and time.monotonic() - began < 60:
+    while len(list(folder.glob("[123]"))) < 2 and time.monotonic() - began < 60:
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "launcher", "seen"),
-    [
-        pytest.param(["device=auto"], JOBLIB, {"4", "7"}, marks=pytest.mark.slow),
-        pytest.param(["device=auto,cpu"], JOBLIB, {"all"}, marks=pytest.mark.slow),
-        (["device=auto"], [], {"all"}),
-    ],
-)
-def test_jobs_side_by_side_see_one_gpu_each(tmp_path, monkeypatch, overrides, launcher, seen):
+@pytest.mark.slow
+@pytest.mark.parametrize(("device", "seen"), [("device=auto", {"4", "7"}), ("device=auto,cpu", {"all"})])
+def test_jobs_side_by_side_see_one_gpu_each(tmp_path, monkeypatch, device, seen):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(module, "visible_gpus", lambda: ("4", "7"))
-    monkeypatch.setattr(module, "_job", partial(says_its_gpu, folder=tmp_path, beside=bool(launcher)))
-    assert not sweep([["seed=1,2,3", *overrides]], ["train"], launcher)
+    monkeypatch.setattr(module, "_job", partial(says_its_gpu, folder=tmp_path))
+    assert not sweep([["seed=1,2,3", device]], ["train"], JOBLIB)
     assert {(tmp_path / f"{seed}").read_text() for seed in (1, 2, 3)} == seen
 
 

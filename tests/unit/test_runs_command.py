@@ -199,7 +199,7 @@ def test_a_sweep_names_what_it_needs(tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))
     seen: set[str] = set()
     monkeypatch.setattr(
-        sweep, "_launched", lambda _, jobs, *__: seen.update(reserved(tmp_path)) or [None] * len(jobs)
+        sweep, "_in_turn", lambda *given: seen.update(reserved(tmp_path)) or [None] * len(given[2])
     )
     jobs = ["scene=sand", "scale=small", "device=cpu", "latent_dim=2,3", "scene.design.train=[21,30,38.5]"]
     assert sweep.sweep([jobs], ("simulate", "train")) == []
