@@ -9,7 +9,7 @@ from pathlib import Path
 from nsf import paths, usage, words
 from nsf.errors import ConfigError, NSFError, first_line, out_of_memory
 from nsf.paths import reports_folder
-from nsf.terminal import console, guard
+from nsf.terminal import guard, screen
 from nsf.usage import STAGES, TOOLS
 
 
@@ -125,7 +125,7 @@ def _check_scene(command: str, overrides: Sequence[str]) -> None:
 def _tool(name: str, arguments: list[str]) -> int:
     text, takes = TOOLS[name]
     if takes is not None and {"-h", "--help"} & set(arguments):
-        print(f"usage: nsf {name} {takes}\n\n{text}")
+        print(usage.of_tool(name))
         return 0
     if name in ("view", "serve"):
         from nsf.live.command import main as live
@@ -158,7 +158,7 @@ def _bench(arguments: list[str]) -> int:
 
     folder = options.pop("folder", reports_folder("speed"))
     page = bench(folder, options, lambda text: print(text, file=sys.stderr))
-    _console().print(table(page.with_name("bench.csv")))
+    screen().print(table(page.with_name("bench.csv")))
     return _open(page)
 
 
@@ -235,10 +235,10 @@ def _plan(arguments: list[str]) -> int:
     if "--cfg" in arguments:
         print("\n---\n".join(map(preview.composed, found)), end="")
         return 0
-    console = _console()
+    page = screen()
     for plan in preview.scenes(found):
-        console.print(preview.scene_table(plan), "")
-    console.print(preview.stages_table(found))
+        page.print(preview.scene_table(plan), "")
+    page.print(preview.stages_table(found))
     return 0
 
 
@@ -267,7 +267,7 @@ def _search(arguments: list[str]) -> int:
     from nsf.results.search import best_table
 
     chart = search(arguments)
-    _console().print(best_table(chart.with_name("trials.csv")))
+    screen().print(best_table(chart.with_name("trials.csv")))
     return _open(chart)
 
 
@@ -331,7 +331,7 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
         from nsf.pipeline.outcome import outcome_table
 
         if table := outcome_table(sweeps, {" ".join(failure.job): failure.error for failure in failed}):
-            _console().print(table)
+            screen().print(table)
     for failure in failed:
         print(f"failed: {failure}", file=sys.stderr)
     return 2 if failed else 0
@@ -342,15 +342,11 @@ def _show(page, table: bool = True) -> None:
     if table:
         from nsf.results.table import console_table
 
-        _console().print(console_table(page.parent / "results.csv"))
+        screen().print(console_table(page.parent / "results.csv"))
     from nsf.progress import slowest_stage
 
     print(f"open {page.resolve()}")
     print(slowest_stage())
-
-
-def _console():
-    return console(sys.stdout, None if sys.stdout.isatty() else 160)
 
 
 if __name__ == "__main__":

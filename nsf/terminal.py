@@ -5,6 +5,7 @@ commands. So standard output and error let visible characters through alone; tab
 colours and moves are nsf's, are printed by `console`, which holds their texts to the same.
 """
 
+import os
 import re
 import sys
 from collections.abc import Iterable
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 #: For regular expressions: control characters, line ends, changes of direction, and what no UTF-8 file holds.
 INVISIBLE = "\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff"
+_UNCUT = 10_000  # characters of a line that no terminal shows
 _OBEYED = re.compile(f"(?![\n\t])[{INVISIBLE}]")
 
 
@@ -51,6 +53,12 @@ def guard() -> None:
             stream.reconfigure(errors="replace")
         if stream is not None and not isinstance(stream, _Visible):
             setattr(sys, name, _Visible(stream))
+
+
+def screen() -> "Console":
+    """A console on standard output, as wide as the terminal or COLUMNS says; of any width without both."""
+    wide = sys.stdout.isatty() or "COLUMNS" in os.environ
+    return console(sys.stdout, None if wide else _UNCUT)
 
 
 def console(stream: TextIO, width: int | None = None) -> "Console":

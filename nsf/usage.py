@@ -1,5 +1,11 @@
 """The text of `nsf --help`: stages, tools, examples, groups and keys."""
 
+import re
+import textwrap
+
+WIDTH = 79  # characters of a line
+_HANGING = 32  # characters before a description, at most; a longer command has its description below it
+
 STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
     "simulate": "full-order trajectories of every case",
@@ -29,19 +35,19 @@ TOOLS = {
     ),
     "calibrate": (
         "parameters from observations by runs of model=recurrence, how sure they are, a full-order run there",
-        "observations=FILE [run=RUN] [NAME=LOW..HIGH|VALUE …] [program=N] [full_order=true] [starts=64]\n"
-        "       [device=auto] [folder=PATH]; or trials=N [run=RUN,RUN | +experiment=NAME] [seed=0]\n"
-        "       [folder=PATH]: full-order runs at known parameters, observed with noise",
+        "observations=FILE [run=RUN] [NAME=LOW..HIGH|VALUE …] [program=N] [full_order=true] [starts=64] "
+        "[device=auto] [folder=PATH]; or trials=N [run=RUN,RUN | +experiment=NAME] [seed=0] "
+        "[folder=PATH]: full-order runs at known parameters, observed with noise",
     ),
     "sample": (
         "parameters drawn from distributions, runs in batches: quantiles, sensitivities, a posterior",
-        "[run=RUN] [NAME=norm(30,2)|LOW..HIGH …] [of=height,run_out,opening,z@X:Y:Z] [runs=10000]\n"
-        "       [sensitivities=1024] [full_order=0] [observations=FILE] [program=N] [seed=0] [folder=PATH]",
+        "[run=RUN] [NAME=norm(30,2)|LOW..HIGH …] [of=height,run_out,opening,z@X:Y:Z] [runs=10000] "
+        "[sensitivities=1024] [full_order=0] [observations=FILE] [program=N] [seed=0] [folder=PATH]",
     ),
     "design": (
         "a program of forcing that brings a target about, by least squares, and the full-order run along it",
-        "target=FILE|height=0.1|x@X:Y:Z=0.5 tilt=ANGLE|move=SOLID,SOLID [run=RUN] [NAME=VALUE …] [knots=6]\n"
-        "       [full_order=true] [seed=0] [device=auto] [folder=PATH]",
+        "target=FILE|height=0.1|x@X:Y:Z=0.5 tilt=ANGLE|move=SOLID,SOLID [run=RUN] [NAME=VALUE …] [knots=6] "
+        "[full_order=true] [seed=0] [device=auto] [folder=PATH]",
     ),
     "plan": (
         "what nsf run would do: stages and their states, size, time and room; --cfg: the configuration",
@@ -62,35 +68,52 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling,reduced,batch,recurrence,training]\n"
-        "       [particles=10k,200k,1m] [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10]\n"
-        "       [folder=PATH]; sizes that suit the device by default",
+        "[benches=full_order,scaling,reduced,batch,recurrence,training] "
+        "[particles=10k,200k,1m] [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10] "
+        "[folder=PATH]; sizes that suit the device by default",
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
 _EXAMPLES = """\
 examples:
-  nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
-  nsf run scene=sand stress=deformation affine=none    the baseline beside it, in the same report
-  nsf run scene=sand scene.design.test=[23,30.5]       other held-out cases
-  nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
-  nsf plan scene=cake scale=paper                      what that would take, before it begins
-  nsf run +experiment=table1/scenes scale=small        the jobs of a part of an experiment, and its report
-  nsf run -m +experiment=timestep hydra/launcher=joblib  jobs side by side on this machine
-  nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
-  nsf demo                                             a model in the browser, at once
-  nsf export --html --frames                           the newest deployed run as a page and a film
-  nsf point material=drucker_prager path=oedometer     plot a law before trusting it
-  nsf run --config-dir my/conf scene=mine              groups of a folder of yours, before these
-  nsf view                                             the newest deployment in the browser
-  nsf search scene=sand scene.design.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
-  nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
-  nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
-  nsf bench particles=10k,40k precision=fp32           what a step costs on this machine, and its floor
+  nsf run scene=sand scale=small
+      the paper's method in a minute or two, on a CPU
+  nsf run scene=sand stress=deformation affine=none
+      the baseline beside it, in the same report
+  nsf run scene=sand scene.design.test=[23,30.5]
+      other held-out cases
+  nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150
+      every combination
+  nsf plan scene=cake scale=paper
+      what that would take, before it begins
+  nsf run +experiment=table1/scenes scale=small
+      the jobs of a part of an experiment, and its report
+  nsf run -m +experiment=timestep hydra/launcher=joblib
+      jobs side by side on this machine
+  nsf run -m +experiment=table1 hydra/launcher=slurm
+      jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
+  nsf demo
+      a model in the browser, at once
+  nsf export --html --frames
+      the newest deployed run as a page and a film
+  nsf point material=drucker_prager path=oedometer
+      plot a law before trusting it
+  nsf run --config-dir my/conf scene=mine
+      groups of a folder of yours, before these
+  nsf view
+      the newest deployment in the browser
+  nsf search scene=sand scene.design.validation=[27,31] latent_dim=4..8
+      the r of the smallest error there
+  nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta
+      runs by what made them, the best first
+  nsf runs diff 1a2b 3c4d
+      what differs between two runs, in keys and in result
+  nsf bench particles=10k,40k precision=fp32
+      what a step costs on this machine, and its floor
 
-Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS). Every command takes --config-dir DIR, or
-NSF_CONFIG=DIR: a folder with groups of yours, as DIR/scene/mine.yaml, and experiments, as
-DIR/experiments/mine.yaml."""
+Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS). Every command
+takes --config-dir DIR, or NSF_CONFIG=DIR: a folder with groups of yours, as
+DIR/scene/mine.yaml, and experiments, as DIR/experiments/mine.yaml."""
 
 
 def primary(stage: str) -> str:
@@ -104,7 +127,41 @@ def whole() -> str:
     stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
     tools = "\n".join(f"  {name:<{width}}  {text}" for name, (text, _) in TOOLS.items())
     usage = "usage: nsf STAGE [-m] [+experiment=NAME] [key=value …]"
-    return f"{usage}\n\nstages:\n{stages}\n\nbeside them:\n{tools}\n\n{_EXAMPLES}\n\n{groups_text()}"
+    return fitted(f"{usage}\n\nstages:\n{stages}\n\ntools:\n{tools}\n\n{_EXAMPLES}\n\n{groups_text()}")
+
+
+def of_tool(name: str) -> str:
+    """Of `nsf TOOL --help`, where it has no options of its own."""
+    text, takes = TOOLS[name]
+    return fitted(f"usage: nsf {name} {takes}\n\n{text}")
+
+
+def fitted(text: str) -> str:
+    """Text in lines of at most `WIDTH` characters; what stands behind a gap is broken within its column.
+
+    A comment of a yaml that is too long stands above its key.
+    """
+    return "\n".join(part for line in text.splitlines() for part in _fitted(line))
+
+
+def _fitted(line: str) -> list[str]:
+    indent = " " * (len(line) - len(line.lstrip()))
+    if len(line) <= WIDTH:
+        return [line]
+    if "  # " in line:
+        code, _, comment = line.partition("  # ")
+        return [*_wrapped(f"{indent}# {comment}", f"{indent}# "), code]
+    if line.startswith("# "):
+        return _wrapped(line, "# ")
+    gap = re.match(r" *\S.*?  +(?=\S)", line)
+    if gap and gap.end() > _HANGING:
+        return [gap[0].rstrip(), *_wrapped(f"      {line[gap.end() :]}", "      ")]
+    return _wrapped(line, " " * (gap.end() if gap else 7 if line.startswith("usage: ") else len(indent)))
+
+
+def _wrapped(line: str, hanging: str) -> list[str]:
+    options = {"break_long_words": False, "break_on_hyphens": False}
+    return textwrap.wrap(line, WIDTH, subsequent_indent=hanging, **options)
 
 
 def groups_text() -> str:
@@ -124,7 +181,7 @@ def of_stage(stage: str) -> str:
     name = primary(stage)
     experiment = "" if stage == "point" else " [+experiment=NAME]"
     keys = (CONF / f"{name}.yaml").read_text(encoding="utf-8")
-    return (
+    return fitted(
         f"usage: nsf {stage} [-m]{experiment} [key=value …]\n\n{STAGES[stage]}\n\n{groups_text()}\n\n"
         f"keys and defaults (conf/{name}.yaml):\n{keys}"
     )

@@ -16,10 +16,13 @@ if TYPE_CHECKING:
 _DESCRIPTION = "Writes a reduced run for other programs: any number of formats at once."
 _EXAMPLES = """\
 examples:
-  nsf export --html                                 the newest deploy run, in a browser
-  nsf export sand --live                            the model itself in a page, to steer without a server
-  nsf export deploy/sand/1a2b --vtk --points 1000000   many more points than were trained on
-  nsf export runs/deploy/sand/1a2b3c4d5e6f --frames --color displacement --parameter 33
+  nsf export --html
+      the newest deploy run, in a browser
+  nsf export sand --live
+      the model itself in a page, to steer without a server
+  nsf export deploy/sand/1a2b --vtk --points 1000000
+      many more points than were trained on
+  nsf export runs/deploy/sand/1a2b --frames --color displacement --parameter 33
   nsf export 1a2b --usd --onnx --every 5 --output /tmp/sand
 
 --usd, --onnx and --frames need pip install 'nsf[export]'."""

@@ -90,7 +90,7 @@ def build_report(
     sources = open_sources(runs, first)
     frame = rows_of_runs(sources, question)
     with replaced(Path(folder)) as fresh:
-        table.write(frame, fresh / "results.csv")
+        table.write(table.with_settings(frame), fresh / "results.csv")
         view = view_of(frame, sources)
         bodies = len(list(pictures.best(view.frame)))
         with Progress("report", len(_named(question.plots)) + bodies, "pictures") as progress:

@@ -53,6 +53,7 @@ _CONSOLE = (
     *("stress_error", "speedup_step", "speedup_decoded", "fallback_share"),
 )
 _TELLING = ("variant", "case", "cases", "paper_delta")  # shown where they vary
+_COMPONENTS = 3  # values of a key that have a column each
 _DRAWS = 10_000  # of seeds and cases, for the interval of a mean
 BEYOND = " (beyond)"
 """Ends the variant of rows whose program led beyond what was taught; no mean of the others counts them."""
@@ -165,6 +166,24 @@ def setting(keys: Mapping[str, object]) -> str:
     return "; ".join(f"{key}={value}" for key, value in keys.items())
 
 
+def _settings_of(frame: pd.DataFrame) -> pd.DataFrame:
+    """A column of text for each key of `setting` that a frame lacks."""
+    expanded = pd.DataFrame([settings(text) for text in frame["setting"]], index=frame.index)
+    return expanded.drop(columns=[name for name in expanded if name in frame])
+
+
+def with_settings(frame: pd.DataFrame) -> pd.DataFrame:
+    """A frame with a column for each key of `setting`, and each number of a short list: `field.beta.0`."""
+    expanded = _settings_of(frame)
+    for name in list(expanded):
+        lists = (
+            expanded[name].str.extract(r"\A\[([^\[\]{}]+)\]\Z")[0].str.split(", *", expand=True, regex=True)
+        )
+        if 1 < lists.shape[1] <= _COMPONENTS:
+            expanded = expanded.join(lists.add_prefix(f"{name}."))
+    return pd.concat([frame, expanded], axis=1)
+
+
 def labelled(frame: pd.DataFrame) -> pd.DataFrame:
     """The held-out rows of a report, sorted, with `body`, `variant`, and a column for each setting.
 
@@ -173,8 +192,7 @@ def labelled(frame: pd.DataFrame) -> pd.DataFrame:
     are rivals' errors as δ.
     """
     frame = query(frame, held_out=True).reset_index(drop=True)
-    expanded = pd.DataFrame([settings(text) for text in frame["setting"]], index=frame.index)
-    expanded = expanded.drop(columns=[name for name in expanded if name in frame])
+    expanded = _settings_of(frame)
     if _TRAIN in expanded:
         expanded["training_runs"] = expanded[_TRAIN].map(_length)
     frame = pd.concat([frame, expanded.apply(_numeric)], axis=1)

@@ -3,10 +3,13 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from nsf.paths import files
 from nsf.runs.listing import ABSENT, FIELDS, Entry, text, value_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CASE = "case"
 #: Keys that are shown first, and their titles.
@@ -16,19 +19,23 @@ TITLES = {CASE: CASE, "latent_dim": "r", "sampler.size": "|S|"} | {
 }
 #: Keys that say the same as another, or that no reader looks for.
 _HIDDEN = re.compile(r"_target_$|^(parameters|cases|validation|teaching_cases|files|model\.name|paper)\b")
-#: Units of metrics by the end of their name; δ and other errors are shown in per cent.
+#: Names of classes and hashes of code, which other columns say in words.
+_INTERNAL = re.compile(r"_target_$|^(code|law|files|paper|columns)\b")
+#: Units of metrics by a part of their name; δ and other errors are shown in per cent.
 _METRICS = {"seconds": "s", "ms": "ms", "mib": "MiB", "bytes": "B"}
-_PERCENT = re.compile(r"(^|_)(delta|error)$")
+_METRIC = re.compile(rf"(?:^|_)({'|'.join(_METRICS)})(?:_|$)")
+_PERCENT = re.compile(r"(^|_)(delta|error|error_bound)$")
 #: Keys that a case replaces, which the column of cases shows.
 _PARAMETER_KEY = re.compile(r"parameters\.\w+\.key")
 _PARAMETER_VALUE = re.compile(r"parameters\.(\w+)\.value")
+_COMPONENTS = 3  # values of a key that have a column each
 _UNIT = re.compile(r"^\s*(\w+):[^#\n]*#\s*\[([^\]\d][^\]]*)\]", re.M)
 
 
 def differing(listed: Sequence[Entry], named: Iterable[str] = ()) -> list[str]:
     """The keys in which runs of one stage and scene differ, the best known first, and those that are named.
 
-    A key that parts the runs as an earlier one does is left out, unless it is named.
+    A key that parts the runs as an earlier one does, be it by other values, is left out unless it is named.
     """
     named = [key for key in dict.fromkeys(named) if key not in FIELDS]
     replaced = {
@@ -39,7 +46,8 @@ def differing(listed: Sequence[Entry], named: Iterable[str] = ()) -> list[str]:
     for key in keys:
         if key in named or key in replaced or _HIDDEN.search(key) or not _differs(listed, key):
             continue
-        parting = tuple(text(setting(entry, key)) for entry in listed)
+        values = [text(setting(entry, key)) for entry in listed]
+        parting = tuple(map(values.index, values))
         if key in TITLES or parting not in partings:
             differ.append(key)
         partings.add(parting)
@@ -81,16 +89,33 @@ def _case(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={text(value)}" for name, value in values.items())
 
 
-def records(listed: Sequence[Entry], named: Iterable[str] = ()) -> list[dict[str, Any]]:
-    """A row a run: its fields, the keys of `differing`, every metric, unrounded, and its `path`."""
-    keys, fields = differing(listed, named), [field for field in FIELDS if field != "metric"]
-    return [
-        {field: entry.values[field] for field in fields}
-        | {key: setting(entry, key) for key in keys}
-        | entry.metrics
-        | {"path": str(entry.run.path)}
-        for entry in listed
-    ]
+def table(listed: Sequence[Entry], named: Iterable[str] = ()) -> "pd.DataFrame":
+    """A row a run: its fields, the keys of `differing`, metrics, its `path`, and every other key, unrounded.
+
+    Errors are fractions. `attrs["units"]` has the units of the columns that have one. A key with a value for
+    each network or axis, as `field.beta`, also has a column for each of them, as `field.beta.0`.
+    """
+    import pandas as pd  # 0.5 s that a list need not pay
+
+    fields = [field for field in FIELDS if field != "metric"]
+    frame = pd.DataFrame([_record(entry, [*fields, *differing(listed, named)]) for entry in listed])
+    frame = frame.reindex(columns=frame.columns if len(frame) else [*fields, "path"])
+    frame.attrs["units"] = {name: unit for name in frame if (unit := unit_of(name, shown=False))}
+    return frame
+
+
+def _record(entry: Entry, first: Sequence[str]) -> dict[str, Any]:
+    """A run's row of `table`, some columns first."""
+    row = {key: setting(entry, key) for key in first}
+    row |= {key: value for key, value in entry.metrics.items() if key not in row}
+    row["path"] = str(entry.run.path)
+    for key, value in entry.settings.items():
+        if _INTERNAL.search(key):
+            continue
+        row.setdefault(key, value)
+        if isinstance(value, list) and all(isinstance(one, int | float) for one in value):
+            row |= {f"{key}.{k}": one for k, one in enumerate(value[:_COMPONENTS])}
+    return row
 
 
 def title_of(key: str) -> str:
@@ -99,12 +124,13 @@ def title_of(key: str) -> str:
     return f"{title} [{unit}]" if unit else title
 
 
-def unit_of(key: str) -> str:
-    """Unit of a key or metric; empty where it has none."""
+def unit_of(key: str, shown: bool = True) -> str:
+    """Unit of a key or metric; empty where it has none, as of a fraction unless it is shown in per cent."""
     part, *_, leaf = ("", *key.split(".")) if "." not in key else key.split(".")
     if _PERCENT.search(leaf):
-        return "%"
-    return _units().get(part, {}).get(leaf) or _METRICS.get(leaf.rpartition("_")[2] or leaf, "")
+        return "%" if shown else ""
+    metric = _METRIC.search(leaf)
+    return _units().get(part, {}).get(leaf) or (_METRICS[metric[1]] if metric else "")
 
 
 def scaled(key: str, value: Any) -> Any:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nsf import words as words_of
-from nsf.runs.listing import FIELDS, entries, text
+from nsf.runs.listing import entries, text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,19 +25,18 @@ def table(
             in a text stands for anything.
 
     Returns:
-        The fields, the keys in which the runs differ or that were filtered, and every metric, unrounded; the
-        column `path` has the folder of each run.
+        The fields; the keys in which the runs differ or that were filtered; every metric, unrounded, errors
+        as fractions; `path`, the folder of each run; every other key. `attrs["units"]` has the units.
 
     Raises:
         ConfigError: a word is not key=value, or no run has such a key; names the nearest.
     """
     import pandas as pd
 
-    from nsf.runs.columns import records
+    from nsf.runs import columns
 
     wanted = words_of.pairs("runs", words) | {key: _texts(value) for key, value in filters.items()}
-    rows = records(entries(wanted, sort, None if root is None else Path(root)), wanted)
-    frame = pd.DataFrame(rows, columns=None if rows else [*FIELDS[:-1], "path"])
+    frame = columns.table(entries(wanted, sort, None if root is None else Path(root)), wanted)
     frame["created"] = pd.to_datetime(frame["created"], utc=True, format="ISO8601")
     return frame
 

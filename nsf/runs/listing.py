@@ -18,8 +18,8 @@ from nsf.runs.run import Run
 FIELDS = ("stage", "scene", "id", "created", "status", "seconds", "metric")
 #: The metric that stands for a stage, and its title.
 MAIN = {
-    "evaluate": ("delta", "δ"),
-    "superresolve": ("delta", "δ"),
+    "evaluate": ("displacement_error", "error"),
+    "superresolve": ("displacement_error", "error"),
     "train": ("deformation_loss", "loss of g"),
     "deploy": ("light", "error bounds"),
 }

@@ -11,7 +11,7 @@ import pytest
 import torch
 from angles import angle
 
-from nsf.cli import STAGES, main
+from nsf.cli import STAGES, TOOLS, main
 
 
 @pytest.fixture
@@ -45,6 +45,15 @@ def test_help(arguments, capsys):
     assert end.value.code == 0
     assert all(stage in out for stage in STAGES)
     assert re.search(r"^  scene .*\bsand\b", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", [(), *((name,) for name in (*STAGES, *TOOLS))])
+def test_help_fits_a_terminal_of_80_columns(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as end:
+        main([*command, "--help"])
+    assert end.value.code == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
 
 
 @pytest.mark.parametrize("stage", ["run", "point"])

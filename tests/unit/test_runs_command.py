@@ -26,7 +26,8 @@ def root(tmp_path, monkeypatch):
     data = [made("simulate", {"parameters": {"mu": {"key": "material.mu", "value": v}}}) for v in (1.0, 2.0)]
     four, _ = (made("train", {"latent_dim": r, "seed": r - 4}, data) for r in (4, 6))
     deployed = made("deploy", {"model": {"name": "projected"}, "cases": [{"mu": 1.5}]}, [four])
-    made("evaluate", {"evaluation": {"trials": 2}}, [deployed], delta=0.02, step_ms=1.5)
+    errors = {"delta": 0.02, "displacement_error": 0.2}
+    made("evaluate", {"evaluation": {"trials": 2}}, [deployed], **errors, step_ms=1.5)
     with (
         pytest.raises(ValueError, match="lost"),
         Run.open("train", "sand", {"latent_dim": 8, "seed": 0}, data).record(),
@@ -69,13 +70,24 @@ def test_columns_are_what_differs_among_the_runs_shown(root, nsf):
     assert rows(out)[0][-1] == "case"
     assert {row[-1] for row in rows(out)[1:3]} == {"1", "2"}
     _, out, _ = nsf("stage=evaluate")
-    assert rows(out)[0][-1] == "metric"  # of one run, nothing differs
+    assert "displacement_error [%]" in out.splitlines()[0]
+    assert not {"case", "r", "seed"} & set(rows(out)[0])  # of one run, nothing differs
 
 
 def test_a_filtered_key_is_shown_although_all_have_it(root, nsf):
     _, out, _ = nsf("stage=evaluate", "evaluation.trials=*", "model=projected")
-    assert rows(out)[0][-2:] == ["evaluation.trials", "model"]
-    assert rows(out)[1][-2:] == ["2", "projected"]
+    assert "evaluation.trials  model" in out
+    assert rows(out)[1][-4:-2] == ["2", "projected"]
+
+
+def test_a_key_that_parts_runs_as_another_does_has_no_column(root):
+    for r in (4, 6):
+        made(
+            "train", {"latent_dim": r, "field": {"noise": 0.1 * r}, "trainer": {"steps": 100 * r}}, scene="x"
+        )
+    listed = entries({"stage": "train", "scene": "x"})
+    assert differing(listed) == ["latent_dim"]
+    assert differing(listed, ["field.noise"]) == ["latent_dim", "field.noise"]
 
 
 def test_a_narrow_terminal_shows_whole_cells_of_fewer_columns(root, nsf, monkeypatch):
@@ -104,6 +116,14 @@ def test_other_programs_read_json_and_csv(root, nsf):
     assert [(row["delta"], row["status"]) for row in listed] == [(0.02, "complete")]
     frame = pd.read_csv(io.StringIO(nsf("stage=train", "sort=latent_dim", "--csv")[1]))
     assert frame["latent_dim"].tolist() == [4, 6, 8]
+
+
+def test_every_key_has_a_column_and_units_stand_in_attributes(root):
+    made("train", {"latent_dim": 4, "field": {"beta": [16, 24, 32]}}, scene="jelly", training_seconds=2.0)
+    frame = runs.table(stage="train", scene="jelly")
+    assert frame[["field.beta.0", "field.beta.2"]].iloc[0].tolist() == [16, 32]
+    assert frame.attrs["units"]["training_seconds"] == "s"
+    assert frame["training_seconds"].tolist() == [2.0]
 
 
 def test_keys_that_only_some_runs_have_are_no_difference(root):

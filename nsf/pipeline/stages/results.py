@@ -25,6 +25,11 @@ _COARSE = "coarse_"
 _OF_WHOLE_RUNS = (
     *("step_ms", "step_ms_p10", "step_ms_p90", "total_ms", "decode_ms", "memory_mib", "break_even_runs"),
 )
+#: Columns of which the mean over cases is a metric of the run.
+_METRICS = (
+    *("displacement_error", "stress_error", "error_bound", "step_ms_full", "step_ms", "total_ms_full"),
+    *("total_ms", "decode_ms", "memory_full_mib", "memory_mib"),
+)
 
 
 def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> dict:
@@ -231,6 +236,8 @@ def write(
     for name in (*tables, "frames.npz", "cost.json", "summary.json"):
         record.output(name)
     record.metrics.update({name: summary[name] for name in ("delta", "reconstruction_delta")})
+    averages = results[list(_METRICS)].mean(skipna=False)
+    record.metrics.update(averages[np.isfinite(averages)].to_dict())
     record.metrics["diverged"] = results.loc[np.isinf(results["delta"]), "case"].tolist()
 
 

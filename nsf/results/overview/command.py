@@ -1,21 +1,21 @@
 """`nsf runs`: runs listed, shown, compared, verified and deleted."""
 
-import csv
 import json
-import os
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from nsf import words
 from nsf.errors import ConfigError, StorageError
 from nsf.runs import Run
-from nsf.runs.columns import records
+from nsf.runs.columns import table
 from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.runs.pruning import bytes_text, dependents, older, prunable, remove, size_of
-from nsf.terminal import console
+from nsf.terminal import screen
 
-_UNCUT = 10_000  # characters of a line that no terminal shows
+if TYPE_CHECKING:
+    import pandas as pd
+
 USAGE = f"""\
 usage: nsf runs [key=value[,value…] …] [sort=[-]key] [--json|--csv]
        nsf runs show ID
@@ -24,28 +24,37 @@ usage: nsf runs [key=value[,value…] …] [sort=[-]key] [--json|--csv]
        nsf runs rm ID … [yes=true]
        nsf runs prune [key=value …] [older=AGE] [results=true] [yes=true]
 
-Every run there is, newest first, with a column for each key in which the runs shown differ, as far as
-the terminal is wide. --json and --csv print all of it, numbers unrounded, for other programs.
+Every run, the newest first: its error, which is that of displacement, the keys
+in which the runs shown differ, and other results as far as the terminal, or
+COLUMNS, is wide. --json and --csv print every key and metric, numbers
+unrounded and errors as fractions, for other programs.
 
 keys:
-  a field      {", ".join(FIELDS[:-1])}
-  a metric     delta, deformation_loss, training_seconds … as `nsf runs show ID` lists them
-  a key of the configuration, of the run or those that it was made from, by its dotted name:
-               latent_dim, seed, sampler.size, deploy …; field=, sampler= and model= take an option
-Several values are parted by commas, * stands for anything, and a key that is filtered has a column.
+  a field    {", ".join(FIELDS[:-1])}
+  a metric   displacement_error, delta, deformation_loss, training_seconds …
+             as `nsf runs show ID` lists them
+  a key      of the configuration of the run, or of those that it was made from,
+             by its dotted name: latent_dim, seed, sampler.size, deploy …
+             field=, sampler= and model= take an option
+Several values are parted by commas, * stands for anything, and a key that is
+filtered or sorted by has a column.
 
-An ID is stage/scene/hash, or as much of the beginning of it, of scene/hash or of the hash as is unique.
-show     all that is known of one run: its keys, results, files, what it was made from, what needs it
+An ID is stage/scene/hash, or as much of the beginning of it, of scene/hash or
+of the hash as is unique.
+show     all of one run: its keys, results, files, what it was made from, what
+         needs it
 diff     in which keys two runs differ, and by how much their results do
-verify   holds every file to its recorded sha256; exits with 2 if one was changed
+verify   holds every file to its recorded sha256; exits with 2 if one differs
 rm       deletes runs; says what was made from them
-prune    deletes what nothing complete was made from, of those that match: runs that failed, and trajectories,
-         manifolds and deployments that no result needs. older= takes 36h, 7d or 2w. Results (evaluate,
-         superresolve) stay, unless results=true. It says how much that frees, and asks, unless yes=true
+prune    deletes what nothing complete was made from, of those that match: runs
+         that failed, and trajectories, manifolds and deployments that no result
+         needs. older= takes 36h, 7d or 2w. Results (evaluate, superresolve)
+         stay, unless results=true. It says how much that frees, and asks,
+         unless yes=true
 
 examples:
-  nsf runs stage=evaluate scene=sand sort=delta        the smallest error first
-  nsf runs stage=train latent_dim=4,6 'seed=*'         seeds beside the latent dimensions
+  nsf runs stage=evaluate scene=sand sort=displacement_error
+  nsf runs stage=train latent_dim=4,6 'seed=*'
   nsf runs 'status=failed,interrupted,killed'
   nsf runs diff 1a2b 3c4d
   nsf runs prune scene=cake older=2w"""
@@ -73,35 +82,26 @@ def main(arguments: Sequence[str]) -> int:
     runs = _matching(filters, sort or "-created")
     named = [*filters, *([sort.removeprefix("-")] if sort else [])]
     if formats:
-        {"--json": _json, "--csv": _csv}[formats[-1]](records(runs, named))
+        print(_written(table(runs, named), formats[-1]), end="")
     else:
         from nsf.results.overview.tables import runs_table  # rich takes 0.1 s
 
-        screen = _screen()
-        screen.print(runs_table(runs, named, screen.width))
+        page = screen()
+        page.print(runs_table(runs, named, page.width))
     _say(f"broken: {entry.run.path}: {entry.fault}" for entry in runs if entry.fault)
     _say([f"{len(runs)} runs" + ("" if arguments else ", of which `nsf runs --help` says more")])
     return 0
 
 
-def _screen():
-    """A console as wide as the terminal, or as COLUMNS says; as wide as need be where there is neither."""
-    wide = sys.stdout.isatty() or "COLUMNS" in os.environ
-    return console(sys.stdout, None if wide else _UNCUT)
-
-
-def _json(rows: Sequence[Mapping[str, Any]]) -> None:
-    print(json.dumps(rows, indent=1, ensure_ascii=False, default=str))
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> None:
+def _written(frame: "pd.DataFrame", form: str) -> str:
+    """A table of runs as JSON or CSV."""
     from nsf.results.formats import spreadsheet  # templates take 0.1 s
 
-    names = dict.fromkeys(name for row in rows for name in row)
-    writer = csv.DictWriter(sys.stdout, list(names) or [*FIELDS[:-1], "path"], lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({name: spreadsheet(value) for name, value in row.items()})
+    frame = frame.convert_dtypes()  # whole numbers stay whole where some runs have none
+    if form == "--csv":
+        return frame.map(spreadsheet).to_csv(index=False)
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return json.dumps(rows, indent=1, ensure_ascii=False, default=str) + "\n"
 
 
 def _matching(filters: dict[str, str], sort: str = "-created") -> list[Entry]:
@@ -126,14 +126,14 @@ def _show(ids: Sequence[str]) -> int:
     from nsf.results.overview.tables import run_table
 
     (run,) = _named("show", ids, 1)
-    _screen().print(run_table(run, Run.find()))
+    screen().print(run_table(run, Run.find()))
     return 0
 
 
 def _diff(ids: Sequence[str]) -> int:
     from nsf.results.overview.tables import difference_table
 
-    _screen().print(difference_table(*_named("diff", ids, 2)))
+    screen().print(difference_table(*_named("diff", ids, 2)))
     return 0
 
 

@@ -17,39 +17,52 @@ from nsf.runs.listing import FIELDS, MAIN, ORIGIN, Entry, flat, text
 from nsf.runs.pruning import bytes_text, size_of
 
 _MOST = 6  # keys that have a column, beside those of `TITLES` and those that are named
-_WIDEST = 28  # characters of a cell
+_WIDEST = 28  # characters of a cell of a terminal
+#: Metrics that have a column where there is room for it.
+_RESULTS = ("delta", "stress_error", "error_bound", "step_ms_full", "step_ms")
+_WIDE = 1000  # characters of a line that no terminal shows, where no text is cut
 _GAP = 2  # characters between columns
 
 
 @dataclass(frozen=True)
 class Column:
-    """A field of listed runs, or a key."""
+    """A field of listed runs, a metric or a key.
+
+    Attributes:
+        key: by which runs are filtered and sorted.
+        of: the metric that the field `metric` is in all runs, where it is one.
+    """
 
     key: str
+    of: str = ""
 
     @property
     def title(self) -> str:
         """Its heading, with the unit."""
-        return "time [s]" if self.key == "seconds" else title_of(self.key)
+        return "time [s]" if self.key == "seconds" else title_of(self.of or self.key)
 
     @property
     def numeric(self) -> bool:
         """Whether it is aligned to the right."""
-        return self.key == "seconds"
+        return self.key in ("seconds", *_RESULTS) or self.of != ""
 
     def value(self, entry: Entry) -> Any:
         """The value of a run, by which it sorts."""
         return setting(entry, self.key)
 
-    def text(self, entry: Entry) -> str:
-        """The value as shown."""
+    def text(self, entry: Entry, widest: int | None = _WIDEST) -> str:
+        """The value as shown, in at most so many characters if it is neither a number nor a case."""
         value = self.value(entry)
         if self.key == "created":
             return _when(value) if value else text(value)
         if self.key == "metric":
-            return _metric(entry)
+            return _metric(entry, self.of)
         shown = brief(_rounded(self.key, value) if self.key in entry.values else text(value))
-        return shown if self.key == CASE or len(shown) <= _WIDEST else f"{shown[: _WIDEST - 1]}…"
+        if widest is None or len(shown) <= widest or self.key == CASE or isinstance(value, int | float):
+            return shown
+        if isinstance(value, list | tuple):
+            return f"{text(value[0])} … ({len(value)})"
+        return f"{shown[: widest - 1]}…"
 
 
 def columns(listed: Sequence[Entry], named: Sequence[str] = ()) -> tuple[list[Column], list[str]]:
@@ -57,7 +70,10 @@ def columns(listed: Sequence[Entry], named: Sequence[str] = ()) -> tuple[list[Co
     mains = {MAIN[entry.run.stage][0] if entry.run.stage in MAIN else "" for entry in listed}
     keys = differing(listed, [key for key in named if mains != {key}])  # the metric is there already
     more = [key for key in keys if key not in TITLES and key not in named][_MOST:]
-    return [Column(key) for key in (*FIELDS, *keys) if key not in more], more
+    results = [key for key in _RESULTS if key not in keys and any(key in e.metrics for e in listed)]
+    of = mains.pop() if len(mains) == 1 else ""
+    shown = [key for key in (*FIELDS, *keys, *results) if key not in more]
+    return [Column(key, of if key == "metric" else "") for key in shown], more
 
 
 def runs_table(listed: Sequence[Entry], named: Sequence[str] = (), width: int = 160) -> Group:
@@ -72,7 +88,8 @@ def runs_table(listed: Sequence[Entry], named: Sequence[str] = (), width: int = 
         width: [characters].
     """
     every, more = columns(listed, named)
-    texts = {column: [column.text(entry) for entry in listed] for column in every}
+    widest = _WIDEST if width < _WIDE else None
+    texts = {column: [column.text(entry, widest) for entry in listed] for column in every}
     keys = {key for key in named if key not in FIELDS}
     shared = [c for c in every if len(listed) > 1 and len(set(texts[c])) == 1 and c.key not in keys]
     legend = _numbered(texts)
@@ -110,16 +127,17 @@ def _numbered(texts: dict[Column, list[str]]) -> dict[str, str]:
 
 def _rank(key: str, named: Sequence[str]) -> int:
     """The order in which columns take the room that there is."""
-    order = ("id", "metric", "stage", "scene", "", "status", "seconds", "created")
+    order = ("id", "metric", "stage", "scene", "", "status", *_RESULTS, "seconds", "created")
     return 1 if key in named else order.index(key if key in order else "")
 
 
-def _metric(entry: Entry) -> str:
+def _metric(entry: Entry, of: str) -> str:
+    """The metric of a run, with its title and unit unless a heading has them."""
     value = entry.values["metric"]
     if not isinstance(value, int | float):
         return "diverged" if entry.metrics.get("diverged") else text(value)
-    _, title = MAIN[entry.run.stage]
-    return f"{title} {number(value, 100)} %" if title == "δ" else f"{title} {number(value)}"
+    key, title = MAIN[entry.run.stage]
+    return _rounded(key, value) if of else f"{title} {_with_unit(key, value)}"
 
 
 def run_table(run: Run, everything: Sequence[Run]) -> Table:

@@ -25,7 +25,14 @@ def root(tmp_path_factory):
     with pytest.raises(ValueError, match="lost"), failing(root, data).record():
         raise ValueError("lost")
     for run, delta in zip(trained, (0.02, 0.001), strict=True):
-        made(root, "evaluate", {"evaluation": {"trials": 2}}, [run, data[0]], delta=delta)
+        made(
+            root,
+            "evaluate",
+            {"evaluation": {"trials": 2}},
+            [run, data[0]],
+            delta=delta,
+            displacement_error=delta,
+        )
     made(root, "simulate", {"parameters": {"E": {"key": "material.E", "value": 3.0}}}, scene="jelly")
     return root
 
