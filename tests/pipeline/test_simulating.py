@@ -5,6 +5,7 @@ import threading
 import weakref
 from dataclasses import replace
 
+import helped
 import numpy as np
 import pytest
 
@@ -60,25 +61,9 @@ def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_
     assert sum(counted) == len(pipeline.runs_of("simulate")) * (pipeline.scene.steps + 1)
 
 
-def count(number, advance, folder):
-    """The work of a process in the tests below."""
-    for _ in range(3):
-        advance(1)
-    return number, os.getpid(), cores.claimed(folder, 0)
-
-
-def fail(number, advance, folder):
-    raise InstabilityError("it burst")
-
-
-def go_on(number, advance, folder):
-    while True:
-        advance(1)
-
-
 def test_helping_processes_count_here():
     steps = []
-    with cores.helping(count, 1, steps.append) as helpers:
+    with cores.helping(helped.count, 1, steps.append) as helpers:
         assert cores.claimed(helpers.folder, 1)
         ((number, process, claimed),) = helpers.results()
         assert not cores.claimed(helpers.folder, 0)
@@ -87,12 +72,12 @@ def test_helping_processes_count_here():
 
 
 def test_an_error_of_another_process_is_one_here():
-    with pytest.raises(InstabilityError, match="it burst"), cores.helping(fail, 1, print) as helpers:
+    with pytest.raises(InstabilityError, match="it burst"), cores.helping(helped.fail, 1, print) as helpers:
         helpers.results()
 
 
 def test_processes_end_where_this_one_fails():
-    with pytest.raises(KeyboardInterrupt), cores.helping(go_on, 1, lambda steps: None):
+    with pytest.raises(KeyboardInterrupt), cores.helping(helped.go_on, 1, lambda steps: None):
         raise KeyboardInterrupt
 
 

@@ -1,0 +1,24 @@
+"""The work of helping processes, in a module that they import at once."""
+
+import os
+
+from nsf.errors import InstabilityError
+from nsf.pipeline import cores
+
+
+def count(number, advance, folder):
+    """Three steps."""
+    for _ in range(3):
+        advance(1)
+    return number, os.getpid(), cores.claimed(folder, 0)
+
+
+def fail(number, advance, folder):
+    """Nothing."""
+    raise InstabilityError("it burst")
+
+
+def go_on(number, advance, folder):
+    """Steps without an end."""
+    while True:
+        advance(1)
