@@ -211,7 +211,8 @@ def checked(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
-    return pickle.loads(_packed(config)[0])
+    tree, _ = _checked(config)
+    return pickle.loads(_node(tree))
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -220,27 +221,34 @@ def resolve(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
-    return pickle.loads(_packed(config)[1])
+    _, plain = _checked(config)
+    return pickle.loads(_node(plain))
 
 
-def _packed(config: DictConfig) -> tuple[bytes, bytes]:
-    """A configuration and the same resolved, both checked and pickled."""
+def _checked(config: DictConfig) -> tuple[bytes, bytes]:
+    """The pickled trees of a configuration and of the same resolved, both checked."""
     try:
-        return _checked(pickle.dumps(OmegaConf.to_container(config)), os.environ.get("NSF_REPORTS"))
+        tree = pickle.dumps(OmegaConf.to_container(config))
+        return tree, _resolved(tree, os.environ.get("NSF_REPORTS"))
     except RecursionError as error:
         raise ConfigError("the configuration is nested too deeply; flatten it") from error
 
 
 @lru_cache(maxsize=64)
-def _checked(pickled: bytes, _reports: str | None) -> tuple[bytes, bytes]:
-    """`_packed` of a pickled tree: jobs and stages ask for the same again. A value may name NSF_REPORTS."""
-    raw = pickle.loads(pickled)
-    config = OmegaConf.create(raw)
-    plain = resolved(config)
+def _node(tree: bytes) -> bytes:
+    """A pickled tree as a pickled configuration: stages ask for the same again."""
+    return pickle.dumps(OmegaConf.create(pickle.loads(tree)))
+
+
+@lru_cache(maxsize=64)
+def _resolved(tree: bytes, _reports: str | None) -> bytes:
+    """A pickled tree resolved and checked: jobs ask for the same again. A value may name NSF_REPORTS."""
+    raw = pickle.loads(tree)
+    plain = resolved(pickle.loads(_node(tree)))
     refuse_keys(plain)
     targets.check(plain)
     refuse_unread(raw, plain)
-    return pickle.dumps(config), pickle.dumps(OmegaConf.create(plain))
+    return pickle.dumps(plain)
 
 
 def of_launcher(override: str) -> bool:

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from forked import PlainReport, SignalAt, run_nsf
 
+from nsf.cli import main
 from nsf.runs import Run
 
 
@@ -53,18 +54,16 @@ def test_a_value_out_of_range_shows_before_the_first_job(nsf, copied):
 @pytest.mark.parametrize(
     ("override", "quoted"),
     [
-        ("latent_dimm=4,6", "'latent_dimm'"),
         ("model=projected,baseline", "model=baseline"),
         ("latent_dim=[", "latent_dim=["),
-        ("latent_dim", "latent_dim"),
         ("field._target_=os.system,os.remove", "os.system is refused"),
     ],
 )
-def test_bad_grammar_is_refused_as_in_a_single_run(nsf, copied, override, quoted):
-    outcome = nsf("train", copied(), override, multirun=True)
-    assert outcome.code == 2
-    assert quoted in outcome.err
-    assert "Traceback" not in outcome.err
+def test_bad_grammar_is_refused_as_in_a_single_run(override, quoted, tiny, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["train", "-m", *tiny, override])
+    assert end.value.code == 2
+    assert quoted in capsys.readouterr().err
 
 
 def test_control_c_stops_all_jobs(nsf, copied):
@@ -75,11 +74,11 @@ def test_control_c_stops_all_jobs(nsf, copied):
     assert [run.manifest["status"] for run in Run.find("train", root=root)] == ["interrupted"]
 
 
-def test_points_of_several_materials(tmp_path):
-    arguments = ["point", "-m", "material=hencky,drucker_prager", "path=simple_shear,oedometer"]
+def test_points_of_several_paths(tmp_path):
+    arguments = ["point", "-m", "material=hencky", "path=simple_shear,oedometer", "point.points=20"]
     outcome = run_nsf(arguments, tmp_path / "runs", tmp_path / "work")
     assert outcome.code == 0, outcome.err
-    assert len(list((tmp_path / "work/reports/point").glob("*.csv"))) == 4
+    assert len(list((tmp_path / "work/reports/point").glob("*.csv"))) == 2
 
 
 @pytest.mark.slow

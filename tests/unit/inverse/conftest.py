@@ -7,7 +7,7 @@ from nsf.inverse import Model
 #: The friction angle, and the speed at which the column starts, which only the scene's configuration knows.
 TWO = (
     "model=recurrence",
-    *("model.runs=24", "model.descents=200", "model.width=32"),
+    *("model.runs=16", "model.descents=150", "model.width=32", "model.members=2"),
     "scene.bodies.column.velocity=[0.1,0,0]",
     "+scene.parameters.friction_angle.range=[22,38]",
     "+scene.parameters.speed={key:scene.bodies.column.velocity.0,unit:m/s,range:[0.05,0.3]}",

@@ -155,7 +155,7 @@ def pushed(pipeline_at, tmp_path_factory):
     pipeline = pipeline_at(
         tmp_path_factory.mktemp("pushed") / "runs",
         "model=recurrence",
-        *("model.runs=4", "model.stress=4", "model.descents=200", "model.width=24"),
+        *("model.runs=4", "model.stress=4", "model.descents=100", "model.width=24", "model.members=2"),
         "+scene.program=0",
         "trust.limit=1e6",  # a quick fit is far off
         "+scene.forcing={gravity:{},colliders:{plate:{_target_:nsf.scenes.RandomPush,direction:[1,0,0],"

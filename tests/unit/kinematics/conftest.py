@@ -1,5 +1,7 @@
 """Small snapshots on disk and quickly trained manifolds of every field."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -49,11 +51,21 @@ def fields():
     return FIELDS
 
 
+@pytest.fixture(scope="session")
+def trained_of(snapshots, tmp_path_factory):
+    """(name of a field) → its manifold and metrics."""
+
+    @cache
+    def of(name):
+        return train(snapshots, FIELDS[name], QUICK, LATENT, 0, tmp_path_factory.mktemp(name), "cpu")
+
+    return of
+
+
 @pytest.fixture(scope="session", params=FIELDS)
-def trained(request, snapshots, tmp_path_factory):
+def trained(request, trained_of):
     """(manifold, metrics) of each field."""
-    folder = tmp_path_factory.mktemp(request.param)
-    return train(snapshots, FIELDS[request.param], QUICK, LATENT, 0, folder, "cpu")
+    return trained_of(request.param)
 
 
 @pytest.fixture(scope="session")

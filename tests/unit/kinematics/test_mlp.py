@@ -15,7 +15,7 @@ from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
 from nsf.kinematics.training.train import train
 
 FIELD = MlpField(beta=4)
-QUICK = FastTrainer(steps=[250, 1, 1], frames_per_batch=13, particles_per_batch=40)
+QUICK = FastTrainer(steps=[200, 1, 1], frames_per_batch=13, particles_per_batch=40)
 LATENT = 3
 
 
