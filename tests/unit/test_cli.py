@@ -9,7 +9,6 @@ import sys
 import pandas as pd
 import pytest
 import torch
-from angles import angle
 
 from nsf.cli import STAGES, TOOLS, main
 
@@ -81,17 +80,11 @@ def test_version(capsys):
 
 
 REFUSED = [
-    ("run", "lantent_dim=4", ["'lantent_dim'", "did you mean latent_dim"]),
-    ("run", "field=bassis", ["field=bassis", "did you mean basis?"]),
     ("run", "latent_dim", ["'latent_dim' is not key=value"]),
     ("run", "--fast", ["'--fast' is not key=value"]),
-    ("run", "scene.design.test=[22,26]", ["22", "train and test", "one split"]),
     ("run", "scale=big", ["scale=big", "choose one of small, paper"]),
-    ("run", "material.nu=0.6", ["material.nu=0.6", "(-1, 0.5)"]),
-    ("run", "latent_dim=0", ["latent_dim=0", "at least 1"]),
     ("run", "device=gpu", ["device=gpu"]),
     ("run", "deploy.split=foo", ["deploy.split=foo", "test, validation or train"]),
-    ("run", "field._target_=os.system", ["os.system is refused"]),
     ("point", "path=pull", ["path='pull'", "simple_shear"]),
     ("point", "point.amplitude=abc", ["point.amplitude=abc"]),
     ("point", "point.rate=0", ["point.rate=0"]),
@@ -203,7 +196,6 @@ BEFORE_ANY_WORK = [
     ("sampler.size=501", ["sampler.size=501", "500 particles"]),
     ("deploy.dt_multiplier=0", ["dt_multiplier=0"]),
     ("deploy.batch=0", ["deploy.batch=0"]),
-    ("deploy.changes={scene.gravty:[0,0,-1]}", ["'scene.gravty'", "did you mean scene.gravity"]),
     ("deploy.changes={scene.bodies.column.particles:400}", ["column.particles", "other particles"]),
     ("deploy.changes={material.nu:0.6}", ["deploy.changes", "material.nu=0.6"]),
     ("evaluation.trials=-1", ["evaluation.trials=-1"]),
@@ -212,7 +204,6 @@ BEFORE_ANY_WORK = [
     ("report.name=../elsewhere", ["report.name=../elsewhere", "report.folder"]),
     ("report.folder=/proc/reports", ["no report can be written to /proc/reports", "set report.folder"]),
     ("tracking=wandb", ["tracking=wandb", "tensorboard"]),
-    ("projector.iterations=maybe", ["iterations=maybe"]),
 ]
 
 
@@ -241,14 +232,10 @@ def simulation_stage():
     return simulation
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [("field=mlp", "field=basis"), ("integration=search", "integration=superset; set it")],
-)
-def test_what_is_not_deployed_together_is_refused_before_any_work(nsf, override, message):
-    code, _, err = nsf("run", "scene=sand", "device=cpu", "deploy.batch=2", override, tiny_scene=False)
+def test_what_is_not_deployed_together_is_refused_before_any_work(nsf):
+    code, _, err = nsf("run", "deploy.batch=2", "integration=search")
     assert code == 2
-    assert f"deploy.batch=2 needs {message}" in err
+    assert "deploy.batch=2 needs integration=superset; set it" in err
     assert "deploy.batch=1" in err
 
 
@@ -259,9 +246,8 @@ def test_a_removed_key_of_teaching_names_its_remedy(nsf):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
-@pytest.mark.parametrize("stage", ["run", "point"])
-def test_a_gpu_where_there_is_none(nsf, tmp_path, stage):
-    code, _, err = nsf(stage, "device=cuda", tiny_scene=stage == "run")
+def test_a_gpu_where_there_is_none(nsf, tmp_path):
+    code, _, err = nsf("run", "device=cuda")
     assert code == 2
     assert "device=cuda" in err
     assert "device=cpu" in err
@@ -300,49 +286,11 @@ def test_a_stage_before_its_time_names_the_command(nsf, tmp_path, stage, needed)
     assert not [p for p in files(tmp_path) if p.name != "manifest.json"]
 
 
-def test_runs_are_listed_and_compared(nsf, chain, monkeypatch):
-    monkeypatch.setenv("NSF_RUNS", str(chain.root))
-    monkeypatch.setenv("COLUMNS", "160")
-    code, out, _ = nsf("runs", "stage=evaluate", "scene=sand", "latent_dim=4", tiny_scene=False)
-    assert code == 0
-    assert chain.pipeline.evaluation.hash in out
-    one, two = (chain.pipeline.simulation(angle(value)).hash for value in (22.0, 30.0))
-    code, out, _ = nsf("runs", "diff", one, two[:8], tiny_scene=False)
-    assert code == 0
-    assert "parameters.friction_angle.value" in out
-
-
-@pytest.mark.parametrize(
-    ("words", "quoted"),
-    [
-        (["stage=evaluate", "sort=dleta"], "did you mean delta"),
-        (["--all"], "'--all' is not key=value"),
-        (["diff", "abc"], "takes two runs, not 1"),
-        (["diff", "abc", "def"], "no run is, or begins with, 'abc'"),
-    ],
-)
-def test_runs_refuses_what_it_does_not_know(nsf, chain, monkeypatch, words, quoted):
-    monkeypatch.setenv("NSF_RUNS", str(chain.root))
-    code, _, err = nsf("runs", *words, tiny_scene=False)
-    assert code == 2
-    assert quoted in err
-
-
-def test_point_of_materials(nsf, tmp_path):
-    materials = ("hencky", "drucker_prager")
-    for material in materials:
-        code, out, _ = nsf("point", f"material={material}", "path=simple_shear", tiny_scene=False)
-        assert code == 0
-        found = re.findall(r"(\S+simple_shear\.(?:png|csv|svg))", out)
-        assert found
-        assert all(os.path.getsize(path) > 0 for path in found)
-    tables = sorted((tmp_path / "reports/point").glob("*.csv"))
-    assert len(tables) == len(materials)
-
-
 def test_point_gives_the_laws_values(nsf, tmp_path):
     """physics.md: Hencky at γ = 0.2, E = 1e6, ν = 0.3."""
-    nsf("point", "material=hencky", "path=simple_shear", tiny_scene=False)
+    code, out, _ = nsf("point", "material=hencky", "path=simple_shear", tiny_scene=False)
+    assert code == 0
+    assert {path.rsplit(".")[-1] for path in re.findall(r"\S+simple_shear\.\w+", out)} >= {"png", "csv"}
     (table,) = (tmp_path / "reports/point").glob("*.csv")
     last = pd.read_csv(table).iloc[-1]
     assert last["amplitude"] == pytest.approx(0.2)

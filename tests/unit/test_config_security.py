@@ -183,7 +183,7 @@ SECRETS = [
 )
 def test_the_environment_is_not_read(monkeypatch, key, text):
     monkeypatch.setenv("SECRET", "s3cret")
-    found = config.load()
+    found = OmegaConf.create({"scene": {"name": "sand", "dx": 0.1}, "scale": "small"})
     OmegaConf.update(found, key, text)
     with pytest.raises(ConfigError, match=rf"{key}: .* is refused|is missing") as refusal:
         config.resolve(found)
@@ -250,29 +250,32 @@ hydra:
 """
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        LOGGING,
-        "hydra: {callbacks: {evil: {_target_: nsf.storage.write_json, path: MARKER, value: 1}}}",
-        "hydra: {job: {env_set: {PYTHONSTARTUP: MARKER}}}",
-        "hydra: {job: {chdir: true}}",
-        "hydra: {sweep: {dir: MARKER}}",
-        "hydra: {launcher: {n_jobs: 99}}",
-        "hydra: null",
-        "hydra: 5",
-    ],
-)
-def test_a_scene_sets_nothing_of_hydra(conf, tmp_path, text):
+OF_HYDRA = [
+    LOGGING,
+    "hydra: {callbacks: {evil: {_target_: nsf.storage.write_json, path: MARKER, value: 1}}}",
+    "hydra: {job: {env_set: {PYTHONSTARTUP: MARKER}}}",
+    "hydra: {job: {chdir: true}}",
+    "hydra: {sweep: {dir: MARKER}}",
+    "hydra: {launcher: {n_jobs: 99}}",
+    "hydra: null",
+    "hydra: 5",
+]
+
+
+def test_a_scene_sets_nothing_of_hydra(conf, tmp_path):
     """Hydra makes objects, and runs them, from its own part of a job's configuration."""
     marker = tmp_path / "executed"
-    scene = "# @package _global_\ndefaults:\n  - sand\n" + text.replace("MARKER", str(marker))
-    (conf / "scene/evil.yaml").write_text(scene)
-    with pytest.raises(NSFError):
-        config.load(["scene=evil"])
-    with pytest.raises(NSFError):
-        sweep([["scene=evil,sand"]], ["simulate"])
-    assert not marker.exists()
+    for number, text in enumerate(OF_HYDRA):
+        scene = "# @package _global_\ndefaults:\n  - sand\n" + text.replace("MARKER", str(marker))
+        (conf / f"scene/evil{number}.yaml").write_text(scene)
+    for number, text in enumerate(OF_HYDRA):
+        with pytest.raises(NSFError):
+            config.load([f"scene=evil{number}"])
+        assert not marker.exists(), text
+    for number in (0, 1):
+        with pytest.raises(NSFError):
+            sweep([[f"scene=evil{number},sand"]], ["simulate"])
+        assert not marker.exists()
 
 
 def test_an_experiment_sets_nothing_of_hydra(tmp_path):
@@ -324,9 +327,9 @@ def test_a_yaml_that_cannot_be_read_is_told_by_name(conf, tmp_path, name, monkey
         config.read(conf / "scene/evil.yaml")
 
 
-@pytest.mark.parametrize("name", ["NUL", "latin-1", "utf-16", "nested", "syntax"])
-def test_a_broken_yaml_is_nothing_to_others(conf, name):
-    (conf / "scene/evil.yaml").write_bytes(BROKEN[name][0])
+def test_a_broken_yaml_is_nothing_to_others(conf):
+    for name in ("NUL", "latin-1", "utf-16", "nested", "syntax"):
+        (conf / f"scene/{name}.yaml").write_bytes(BROKEN[name][0])
     assert config.load(["scene=sand"])
 
 

@@ -268,6 +268,9 @@ def test_rm_says_what_was_made_from_a_run_and_takes_no_silence_for_yes(root, nsf
         (["prune", "stgae=train"], "did you mean stage"),
         (["prune", "method=nsf"], "method was removed; set stress="),
         (["show"], "takes one run"),
+        (["stage=evaluate", "sort=dleta"], "did you mean delta"),
+        (["--all"], "'--all' is not key=value"),
+        (["diff", "abc"], "takes two runs, not 1"),
     ],
 )
 def test_what_is_refused(root, nsf, words, told):

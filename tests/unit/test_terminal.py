@@ -22,9 +22,12 @@ def terminal(monkeypatch):
     return make
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+PLAN = ["plan", "scene=drop", "scale=small"]
+
+
 @pytest.mark.parametrize(
-    "words", [["--help"], ["run", "--help"], ["plan", "scene=drop", "scale=small"], ["runs"]], ids=" ".join
+    ("encoding", "words"),
+    [*(("ascii", words) for words in (["--help"], ["run", "--help"], PLAN, ["runs"])), ("cp1252", PLAN)],
 )
 def test_what_a_terminal_cannot_show_is_replaced(terminal, encoding, words, tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))

@@ -41,7 +41,7 @@ def told(capsys, *arguments) -> str:
     return text
 
 
-@pytest.mark.parametrize("how", ["--config-dir DIR", "--config-dir=DIR", "NSF_CONFIG"])
+@pytest.mark.parametrize("how", ["--config-dir=DIR", "NSF_CONFIG"])
 def test_its_groups_and_experiments_come_first(folder, monkeypatch, capsys, how):
     monkeypatch.chdir(folder.parent)
     words = how.replace("DIR", "own").split()
