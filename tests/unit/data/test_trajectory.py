@@ -115,7 +115,7 @@ def test_a_file_cut_short_anywhere_is_refused(write, tmp_path):
     path, _ = write()
     whole = path.read_bytes()
     cut = tmp_path / "cut.h5"
-    step = max(1, len(whole) // 400)
+    step = max(1, len(whole) // 100)
     for size in sorted({*range(0, len(whole), step), *range(len(whole) - 40, len(whole)), 1, 8, 95, 96, 97}):
         cut.write_bytes(whole[:size])
         with pytest.raises(SchemaError, match=r"cut\.h5 is truncated or not HDF5"):
@@ -127,7 +127,7 @@ def test_damaged_bytes_never_give_another_error(write, tmp_path):
     whole = path.read_bytes()
     damaged = tmp_path / "damaged.h5"
     refused = 0
-    for start in range(0, len(whole), max(1, len(whole) // 150)):
+    for start in range(0, len(whole), max(1, len(whole) // 60)):
         damaged.write_bytes(whole[:start] + b"\xff" * 16 + whole[start + 16 :])
         try:
             with Trajectory.open(damaged) as trajectory:
@@ -339,8 +339,7 @@ def test_a_pipe_is_no_trajectory(tmp_path):
         Trajectory.open(tmp_path / "a.h5")
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("field", COMPONENTS)
+@pytest.mark.parametrize(("field", "bad"), [*zip(COMPONENTS, (np.nan, np.inf, -np.inf, np.nan), strict=True)])
 def test_frames_are_finite_where_they_are_read(write, field, bad):
     path, _ = write()
     with h5py.File(path, "r+") as file:
@@ -373,7 +372,7 @@ def test_a_run_s_trajectory_is_what_the_run_left(write, tmp_path):
     Trajectory.open(own).close()
     whole = own.read_bytes()
     rng = np.random.default_rng(0)
-    for place in rng.integers(len(whole), size=50):
+    for place in rng.integers(len(whole), size=20):
         own.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.integers(8)]) + whole[place + 1 :])
         with pytest.raises(SchemaError, match=r"trajectory\.h5 has sha256 .* it was changed after the run"):
             Trajectory.open(own)
@@ -521,7 +520,7 @@ def test_a_write_that_ends_early_is_not_taken_for_whole(tmp_path):
             sink.settle()
 
 
-@pytest.mark.parametrize("kib", [4, 12, 24, 40, 56, 72])
+@pytest.mark.parametrize("kib", [4, 24, 72])
 def test_a_really_full_disk(tmp_path, constants, monkeypatch, kib):
     if shutil.which("mount") is None:
         pytest.skip("no mount command")

@@ -109,7 +109,7 @@ def mlp(own_root, tiny):
     return pipeline.deploy()
 
 
-@pytest.fixture(scope="module", params=["basis", pytest.param("mlp", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["basis", "mlp"])
 def graphs(request, deployed, tmp_path_factory):
     """A playback and the folder of its graphs; of networks, at points in between."""
     pytest.importorskip("onnxscript")
@@ -173,6 +173,7 @@ def test_onnx_depends_on_the_parameter(graphs):
     assert np.abs(tau - other).max() > 1e-3 * np.abs(tau).max()
 
 
+@pytest.mark.slow
 def test_onnx_tells_of_no_paths(graphs):
     _, folder = graphs
     assert {p.name for p in folder.iterdir()} == {"inputs.npz", *(f"{phase}.onnx" for phase in PHASES)}
@@ -187,6 +188,7 @@ def test_onnx_refuses_more_than_a_file_holds(played, tmp_path, monkeypatch):
         onnx.write(played(), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_field_of_the_rate_has_it_as_an_input(played):
     """`field.affine=rate`: C follows from x̂ and dx̂/dt."""
     pytest.importorskip("onnxscript")
