@@ -1,6 +1,7 @@
 """What tests of several layers share: one tiny chain, simulated, trained, deployed and evaluated once."""
 
 import gc
+import json
 import os
 import shutil
 import signal
@@ -15,7 +16,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import browsers
 import torch
-from tiny import TINY, tiny_pipeline
+from filelock import FileLock
+from tiny import TAUGHT, TINY, tiny_pipeline
 
 # A shell that runs the tests in the background has SIGINT ignored, and so would every program they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -117,14 +119,49 @@ def pipeline_at():
 
 
 @pytest.fixture(scope="session")
-def chain(tmp_path_factory) -> Chain:
+def stored(tmp_path_factory):
+    """(name, make) → a folder that `make(folder)` fills once, whichever worker is the first to ask for it."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def of(name, make) -> Path:
+        folder = base / f"stored-{name}"
+        with FileLock(f"{folder}.lock"):
+            if not (folder / "made").exists():
+                folder.mkdir(exist_ok=True)
+                make(folder)
+                (folder / "made").touch()
+        return folder
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def chain(stored) -> Chain:
     """The tiny chain, made once."""
-    said: list[str] = []
-    root = tmp_path_factory.mktemp("chain") / "runs"
-    pipeline = tiny_pipeline(root, say=said.append)
-    for stage in ("simulate", "train", "deploy", "evaluate"):
-        pipeline.run(stage)
-    return Chain(root, said, pipeline)
+
+    def make(folder):
+        said: list[str] = []
+        pipeline = tiny_pipeline(folder / "runs", say=said.append)
+        for stage in ("simulate", "train", "deploy", "evaluate"):
+            pipeline.run(stage)
+        (folder / "said.json").write_text(json.dumps(said))
+
+    folder = stored("chain", make)
+    said = json.loads((folder / "said.json").read_text())
+    return Chain(folder / "runs", said, tiny_pipeline(folder / "runs"))
+
+
+@pytest.fixture(scope="session")
+def taught_root(chain, stored) -> Path:
+    """Runs of the tiny chain up to a recurrence; shared, so a test that adds to them takes a copy."""
+
+    def make(folder):
+        for stage in ("simulate", "train"):
+            shutil.copytree(chain.root / stage, folder / "runs" / stage)
+        tiny_pipeline(folder / "runs", *TAUGHT).run("teach")
+
+    return stored("taught", make) / "runs"
 
 
 @pytest.fixture(scope="session")
@@ -162,8 +199,6 @@ def reference_manifold():
 @pytest.fixture(scope="session")
 def seal():
     """(run, *more) → its manifest records its files, and `more`, as they now stand, as if they always had."""
-    import json
-
     from nsf.runs import Record
 
     def rewrite(run, *more):

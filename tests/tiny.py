@@ -22,6 +22,12 @@ TINY = (
     "evaluation.picture_frames=3",
 )
 
+#: Keys by which a recurrence is taught on the tiny chain: hardly, in two seconds.
+TAUGHT = (
+    "model=recurrence", "model.runs=8", "model.stress=4", "model.stride=2", "model.members=2",
+    "model.descents=180", "model.width=32",
+)  # fmt: skip
+
 
 def tiny_pipeline(root, *overrides, say=None):
     """The tiny chain, or a variant of it, with its runs under `root`."""

@@ -16,12 +16,14 @@ TWO = (
 
 
 @pytest.fixture(scope="session")
-def deployed(pipeline_at, tmp_path_factory):
+def deployed(pipeline_at, stored):
     """The chain, deployed."""
-    pipeline = pipeline_at(tmp_path_factory.mktemp("inverse") / "runs", *TWO)
-    for stage in ("simulate", "train", "deploy"):
-        pipeline.run(stage)
-    return pipeline
+
+    def make(folder):
+        for stage in ("simulate", "train", "deploy"):
+            pipeline_at(folder / "runs", *TWO).run(stage)
+
+    return pipeline_at(stored("inverse", make) / "runs", *TWO)
 
 
 @pytest.fixture(scope="session")

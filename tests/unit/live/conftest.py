@@ -3,6 +3,7 @@
 import shutil
 
 import pytest
+from tiny import TAUGHT
 
 from nsf.live.model import LiveModel
 from nsf.live.player import Player
@@ -21,11 +22,10 @@ def player(model):
 
 
 @pytest.fixture(scope="session")
-def taught_model(chain, pipeline_at, tmp_path_factory):
+def taught_model(taught_root, pipeline_at, tmp_path_factory):
     """The live model of the tiny chain by a recurrence that was hardly taught, at three held-out values."""
-    root = shutil.copytree(chain.root, tmp_path_factory.mktemp("taught") / "runs")
-    taught = ["model.runs=4", "model.stride=2", "model.descents=200", "model.width=32"]
-    pipeline = pipeline_at(root, "model=recurrence", *taught, "scene.design.test=[24,26,34]")
+    root = shutil.copytree(taught_root, tmp_path_factory.mktemp("taught") / "runs")
+    pipeline = pipeline_at(root, *TAUGHT, "model.stress=0", "scene.design.test=[24,26,34]")
     pipeline.simulate()
     pipeline.deploy()
     return LiveModel(pipeline.deployment, device="cpu", surface=True)
