@@ -11,6 +11,8 @@ from nsf.scalars import number
 
 #: Coordinates of stress where programs force a scene, or do not.
 STRESS = {True: 32, False: 0}
+#: Windows in a step of the descent, likewise; 32 are as near as 128 on sand, bread and cake.
+BATCH = {True: 128, False: 32}
 
 
 @dataclass(frozen=True)
@@ -19,26 +21,27 @@ class Recurrence(Drawn):
 
     Attributes:
         stress: coordinates ŝ of τ beside x̂; None: `STRESS`.
-        members, width, descents, batch, window: as for `nsf.recurrence.Fitting`.
+        batch: windows in a step of the descent, a member; None: `BATCH`.
+        members, width, descents, window: as for `nsf.recurrence.Fitting`.
     """
 
     stress: int | None = None
     members: int = 4
     width: int = 96
     descents: int = 2000
-    batch: int = 128
+    batch: int | None = None
     window: int | None = None
 
     def __post_init__(self):
         super().__post_init__()
         if self.stress is not None:
             number("model.stress", self.stress, least=0, whole=True)
-        self.fitting  # noqa: B018 — checks its values
+        self.fitting_of(True)  # checks its values
 
-    @property
-    def fitting(self) -> Fitting:
-        """How it is fitted."""
-        return Fitting(self.width, self.members, self.descents, self.batch, window=self.window)
+    def fitting_of(self, forced: bool) -> Fitting:
+        """How it is fitted where programs force a scene, or do not."""
+        batch = self.batch if self.batch is not None else BATCH[forced]
+        return Fitting(self.width, self.members, self.descents, batch, window=self.window)
 
     @override
     def stress_of(self, forced: bool) -> int:

@@ -77,10 +77,11 @@ def _recurrence(
         )
     runs, seed = Runs.of(lessons, stride, stress), int(pipeline.config.seed)
     yardstick = _yardstick(pipeline, manifold, validation)
-    form = standardised(runs, model.fitting, scene.dt, stride, pipeline.forced, seed)
+    fitting = model.fitting_of(pipeline.forced)
+    form = standardised(runs, fitting, scene.dt, stride, pipeline.forced, seed)
     sigma = yardstick.moves(form.x_mean, form.x_scale)
     with Progress("teach: fit", model.descents, "descents") as progress:
-        how = sigma, model.fitting, seed, pipeline.device, progress.advance
+        how = sigma, fitting, seed, pipeline.device, progress.advance
         errors = fit(form, runs, yardstick, *how)
     gravity = lessons.inputs.gravity.reshape(-1, 3)
     taught = Taught.of(manifold, physics_hash(scene), scene.dt, gravity)
