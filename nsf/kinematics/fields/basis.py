@@ -39,7 +39,7 @@ from nsf.kinematics.fields.modal import (
 from nsf.kinematics.fields.networks import Committee, FullyConnected, zero_at_rest
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training.phases import MOST_DEEP, MOST_MEMBERS, PHASES, TARGETS, Fit, per_phase
+from nsf.kinematics.training.phases import MOST_DEEP, MOST_MEMBERS, TARGETS, Fit, per_phase
 from nsf.scalars import number
 from nsf.schemas import Number
 
@@ -305,19 +305,20 @@ class BasisManifold(Manifold):
         rows, points = self.points(particles, X)
         points = points.to(self.X.device)
         like = torch.empty(0, dtype=dtype, device=device)
-        networks = {phase: self._deployed(phase, like) for phase in PHASES}
+        # Made where needed: those of many members are large, and most callers take that of x alone.
+        network = functools.cache(lambda phase: self._deployed(phase, like))
         local = functools.cache(lambda: interpolation(points.to(device), self.X.to(device)))
         place = local().value if rows is None else (lambda values: values[rows])
         fields = PlacedFields(
             lambda phase: self.fields[phase].at(
-                place, points if phase == "deformation" else 0, networks[phase], like
+                place, points if phase == "deformation" else 0, network(phase), like
             )
         )
 
         def gradient() -> RestrictedField:
             base = torch.eye(3, dtype=points.dtype, device=points.device).flatten()
             return self.fields["deformation"].at(
-                lambda values: _slope(local(), values), base, networks["deformation"], like
+                lambda values: _slope(local(), values), base, network("deformation"), like
             )
 
         takes_parameters = self.takes_parameters("stress")

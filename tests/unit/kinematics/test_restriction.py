@@ -101,6 +101,19 @@ def test_subset_shares_memory(manifold):
     assert {v.data_ptr() for v in _tensors(few)} <= held
 
 
+@pytest.mark.parametrize("trained", ["basis"], indirect=True)
+def test_positions_need_no_network_of_stress(manifold, monkeypatch):
+    made, deployed = [], type(manifold)._deployed
+
+    def counted(self, phase, like):
+        made.append(phase)
+        return deployed(self, phase, like)
+
+    monkeypatch.setattr(type(manifold), "_deployed", counted)
+    manifold.restrict().position(manifold.training_latents[7])
+    assert made == ["deformation"]
+
+
 def _tensors(restriction):
     if hasattr(restriction, "X"):
         return [restriction.X, *restriction.decoders["stress"].parameters()]
