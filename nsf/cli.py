@@ -210,8 +210,9 @@ def _init(arguments: list[str]) -> int:
 
     mesh = Mesh(options["mesh"], unit=options.get("unit", ""), up=options.get("up", "z")) if options else None
     name = write_project(folder, mesh)
-    run = f"nsf run --config-dir conf scene={name if mesh else 'bracket'}"
-    print(f"wrote {folder}; next: cd {folder}, pip install -e '.[test]', {run}")
+    chain = f"--config-dir conf scene={name}"
+    commands = f"cd {folder}", "pip install -e '.[test]'", f"nsf plan {chain}", f"nsf run {chain}"
+    print(f"wrote {folder}; next:", *commands, f"{folder / 'README.md'} says what to change", sep="\n  ")
     return 0
 
 

@@ -18,7 +18,7 @@ from nsf.scenes.shapes import Mesh
 
 _TEMPLATE = Path(__file__).parent / "template"
 _NAME = "PROJECT"  # which the project's name takes the place of, in texts and in paths
-_SCENE = "bracket"  # which, with a mesh of the user, it also takes the place of
+_MESH = "meshes/bracket.obj"  # which, likewise, a mesh of the user takes the place of
 #: [m] longest edge of the template's mesh, and cells of its scene along it and across its thinnest part.
 _EXTENT, _CELLS, _ACROSS = 0.3, 7.5, 2.5
 #: Cells along a mesh, at most: full-order runs of it still take seconds to a minute.
@@ -43,8 +43,7 @@ def write_project(folder: Path, mesh: Mesh | None = None) -> str:
             to it.
 
     Returns:
-        The name of its package, which is the folder's with `_` for what a name cannot have. A scene with a
-        mesh of the user has it too.
+        The name of its package and scene, which is the folder's with `_` for what a name cannot have.
 
     Raises:
         ConfigError: the folder has files, or no package can have its name, or an installed one has.
@@ -62,10 +61,7 @@ def write_project(folder: Path, mesh: Mesh | None = None) -> str:
     scale = str
     if mesh is not None:
         file = Path(mesh.path).expanduser()
-        names = {
-            f"path: meshes/{_SCENE}.obj": f"path: {json.dumps(f'meshes/{file.name}')}",
-            _SCENE: name,
-        } | names
+        names[f"path: {_MESH}"] = f"path: {json.dumps(f'meshes/{file.name}')}"
         scale = _scaling(mesh)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -74,7 +70,7 @@ def write_project(folder: Path, mesh: Mesh | None = None) -> str:
             for path in sorted(_TEMPLATE.rglob("*")):
                 if path.is_file() and "__pycache__" not in path.parts:
                     text = path.read_text(encoding="utf-8")
-                    text = scale(text) if path.parent.name == "scene" else text
+                    text = scale(text) if path.parent.name in ("scene", "material") else text
                     _write(whole / _renamed(str(path.relative_to(_TEMPLATE)), names), _renamed(text, names))
             if mesh is not None:
                 shutil.rmtree(whole / "meshes")
@@ -114,11 +110,8 @@ def _scaling(mesh: Mesh) -> Callable[[str], str]:
             value = re.sub(r"(?<![\w.])\d+(\.\d+)?", lambda n: _rounded(n[0], s**a * k**b), value)
         return key + colon + value + comment
 
-    head = (
-        f"# The body is {extent:.3g} m long and about {thickness:.2g} m at its thinnest; lengths, times and\n"
-        "# stresses are scaled to that from the template's.\ndefaults:"
-    )
-    return lambda text: "\n".join(map(scaled, text.split("\n"))).replace("defaults:", head, 1)
+    said = f"# Scaled to the mesh, which is {extent:.3g} m long and about {thickness:.2g} m at its thinnest."
+    return lambda text: "\n".join(map(scaled, text.split("\n"))).replace("# Scaled to the mesh.", said)
 
 
 def _rounded(number: str, factor: float) -> str:

@@ -81,9 +81,9 @@ def test_the_mesh_of_the_template_gives_its_scene(tmp_path):
     mesh = Mesh(str(tmp_path / "plain/meshes/bracket.obj"), unit="mm")
     write_project(tmp_path / "scaled", mesh)
     plain, scaled = (
-        [float(n) for n in re.findall(r"\d+\.\d+", text.split("latent_dim")[1])]
+        [float(n) for n in re.findall(r"\d+\.\d+", re.sub("#.*", "", text))]
         for text in (
-            (tmp_path / "plain/conf/scene/bracket.yaml").read_text(),
+            (tmp_path / "plain/conf/scene/plain.yaml").read_text(),
             (tmp_path / "scaled/conf/scene/scaled.yaml").read_text(),
         )
     )
@@ -128,8 +128,7 @@ def test_a_project_is_installed_and_run(tmp_path):
 
     short = ["device=cpu", "trainer.steps=20", "scene.steps=8"]
     few = ["model.runs=4", "model.stress=4", "model.descents=20"]
-    run("nsf.cli", "run", "--config-dir", "conf", "scene=bracket", *short, *few)
-    assert "2 jobs" in run("nsf.cli", "plan", "--config-dir", "conf", "+experiment=bracket", *short)
-    values = ["material.yield_stress=40", "material.saturation=200"]
-    assert "Saturating" in run("nsf.cli", "point", "--config-dir", "conf", "material=saturating", *values)
+    run("nsf.cli", "run", "--config-dir", "conf", "scene=my_project", *short, *few)
+    assert "2 jobs" in run("nsf.cli", "plan", "--config-dir", "conf", "+experiment=rivals", *short)
+    assert "Law" in run("nsf.cli", "point", "--config-dir", "conf", "material=law")
     run("pytest", "-q", "-p", "no:cacheprovider")

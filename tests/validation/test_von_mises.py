@@ -1,13 +1,23 @@
 """Von Mises: plateaus, hardening, softening to damage (physics.md, section 3)."""
 
 import math
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import pytest
 
+from nsf.errors import ConfigError
 from nsf.mpm import precision_of
-from nsf.mpm.materials import Hencky, VonMises, VonMisesHardening, VonMisesSoftening, deformation_path, drive
+from nsf.mpm.materials import (
+    Hencky,
+    IsotropicHardening,
+    VonMises,
+    VonMisesHardening,
+    VonMisesSoftening,
+    deformation_path,
+    drive,
+)
 
 E, NU, TAU_Y = 1e6, 0.3, 2e4
 ELASTIC = Hencky(E, NU)
@@ -262,3 +272,36 @@ def test_a_torn_block_flies_apart(lattice, solver_of):
     np.testing.assert_allclose(
         solver.state.numpy()["v"][right].sum(0), torn["v"][right].sum(0), rtol=1e-12, atol=1e-12
     )
+
+
+@dataclass(frozen=True)
+class Linear(IsotropicHardening):
+    yield_stress: float
+    slope: float
+
+    def flow_stress(self, gamma):
+        return max(self.yield_stress + self.slope * math.pow(gamma, type(gamma)(1.0)), self.yield_stress)
+
+
+@pytest.mark.parametrize(("precision", "rtol"), [("fp64", 1e-12), ("fp32", 1e-3)])
+def test_flow_stress_of_plastic_strain(precision, rtol):
+    """A linear one is linear hardening, whatever the path."""
+    _, F = deformation_path("cyclic_shear", 0.2, 201)
+    laws = Linear(E, NU, TAU_Y, 2.0 * MU * 0.15), VonMisesHardening(E, NU, TAU_Y, hardening=0.15)
+    tau, expected = (drive(law, F, dt=1e-3, precision=precision_of(precision)) for law in laws)
+    np.testing.assert_allclose(tau, expected, rtol=rtol, atol=rtol * TAU_Y)
+
+
+@dataclass(frozen=True)
+class Untyped(Linear):
+    def flow_stress(self, gamma):
+        return self.yield_stress * (1.0 + gamma)
+
+
+@pytest.mark.parametrize(
+    ("law", "slope", "named"),
+    [(Untyped, 0.0, r"number 1.0; write type\(gamma\)\(1.0\)"), (Linear, math.nan, "positive and finite")],
+)
+def test_flow_stress_that_no_run_can_have(law, slope, named):
+    with pytest.raises(ConfigError, match=named):
+        law(E, NU, TAU_Y, slope)

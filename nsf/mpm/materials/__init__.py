@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from nsf.mpm.materials.driver import PATHS, deformation_path, drive
     from nsf.mpm.materials.drucker_prager import DruckerPrager
     from nsf.mpm.materials.fixed_corotated import FixedCorotated
+    from nsf.mpm.materials.hardening import IsotropicHardening
     from nsf.mpm.materials.hencky import Hencky
     from nsf.mpm.materials.herschel_bulkley import HerschelBulkley
     from nsf.mpm.materials.von_mises import VonMises, VonMisesHardening, VonMisesSoftening
@@ -28,6 +29,7 @@ __all__ = [
     "FixedCorotated",
     "Hencky",
     "HerschelBulkley",
+    "IsotropicHardening",
     "LawFunctions",
     "Material",
     "VonMises",

@@ -12,13 +12,14 @@ from nsf.mpm.materials.hencky import hencky_stretches, hencky_tau, hencky_update
 from nsf.mpm.precision import Precision
 
 
-def von_mises_update(precision: Precision, hardened, Params):
+def von_mises_update(precision: Precision, bound, hardened, Params):
     """Warp function of the constitutive update of a von Mises law over Hencky elasticity.
 
     Args:
         precision: floating-point types.
-        hardened: Warp function (τ_Y, δγ, mu, params) → τ_Y [Pa] after plastic flow δγ, the ‖ε̂‖ that it takes.
-        Params: Warp struct of the constants that `hardened` takes.
+        bound: Warp function (h, params) → τ_Y [Pa] of a particle whose history variable is h.
+        hardened: Warp function (h, δγ, mu, params) → h after plastic flow δγ, the ‖ε̂‖ that it takes.
+        Params: Warp struct of the constants that these take.
     """
     import warp as wp
 
@@ -28,7 +29,7 @@ def von_mises_update(precision: Precision, hardened, Params):
     # Written so that a NaN does not count as elastic, and reaches the solver's check.
     @wp.func
     def flow(eps: vec3, history: vecH, mu: real, lam: real, params: Params):
-        tau_Y = history[0]
+        tau_Y = bound(history[0], params)
         third = (eps[0] + eps[1] + eps[2]) / real(3.0)
         deviator = eps - vec3(third, third, third)
         size = wp.length(deviator)
@@ -36,7 +37,7 @@ def von_mises_update(precision: Precision, hardened, Params):
             return eps, history
         # The return removes `flowed` along a unit direction, so ‖ε − proj ε‖ is `flowed` itself.
         flowed = size - tau_Y / (real(2.0) * mu)
-        return eps - (flowed / size) * deviator, vecH(hardened(tau_Y, flowed, mu, params))
+        return eps - (flowed / size) * deviator, vecH(hardened(history[0], flowed, mu, params))
 
     return hencky_update(precision, flow, Params)
 
@@ -55,10 +56,14 @@ def _functions(precision: Precision) -> LawFunctions:
         softening: real
 
     @wp.func
+    def bound(tau_Y: real, params: Params):
+        return tau_Y
+
+    @wp.func
     def hardened(tau_Y: real, flowed: real, mu: real, params: Params):
         return tau_Y + (real(2.0) * mu * params.hardening - params.softening) * flowed
 
-    flowing_update = von_mises_update(precision, hardened, Params)
+    flowing_update = von_mises_update(precision, bound, hardened, Params)
 
     @wp.func
     def tau_of(F: mat33, history: vecH, mu: real, lam: real):

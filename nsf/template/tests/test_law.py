@@ -1,0 +1,20 @@
+"""The law of this project along a path."""
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+from nsf.mpm.materials import deformation_path, drive
+from PROJECT.law import Law
+
+
+def test_sheared_body_carries_its_flow_stress():
+    """After much shear ‖dev τ‖ lies between the least and the largest flow stress on the way."""
+    file = Path(__file__).parents[1] / "conf" / "material" / "law.yaml"
+    values = yaml.safe_load(file.read_text(encoding="utf-8"))
+    law = Law(**{name: float(value) for name, value in values.items() if name != "_target_"})
+    _, F = deformation_path("simple_shear", 1.0, 2001)
+    tau = drive(law, F, dt=1e-3)[-1]
+    carried = np.linalg.norm(tau - np.trace(tau) / 3.0 * np.eye(3))
+    stresses = [law.flow_stress(gamma) for gamma in np.linspace(0.0, 1.0, 101).tolist()]
+    assert 0.99 * min(stresses) <= carried <= 1.01 * max(stresses)
