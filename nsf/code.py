@@ -135,6 +135,8 @@ def _source(path: Path, node: ast.ImportFrom, name: str) -> Path | None:
     """The file from which `from … import name` takes a name: a module of that name, or where it says."""
     module = node.module or ""
     if not node.level:
+        if _PACKAGE in path.parents and module.partition(".")[0] != _PACKAGE.name:
+            return None  # nsf takes nothing from a user's package; looking for one takes 0.03 s
         return _file(f"{module}.{name}") or _file(module)
     folder = path.parents[node.level - 1].joinpath(*filter(None, module.split(".")))
     return _module(folder / name) or _module(folder)

@@ -34,9 +34,11 @@ def _lines(find: Callable[[], Iterator[str]]) -> list[str]:
 
 def _versions() -> Iterator[str]:
     made_with = provenance()
-    commit = str(made_with["commit"] or "unknown")[:12] + (", changed" if made_with["dirty"] else "")
+    commit = ""
+    if made_with["commit"]:
+        commit = f" (commit {made_with['commit'][:12]}{', changed' * bool(made_with['dirty'])})"
     for name, version in made_with["versions"].items():
-        yield f"{name:<10} {version or 'missing'}" + (f" (commit {commit})" if name == "nsf" else "")
+        yield f"{name:<10} {version or 'missing'}{commit * (name == 'nsf')}"
     yield f"{'system':<10} {platform.platform()}"
 
 

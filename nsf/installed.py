@@ -7,20 +7,25 @@ installed, though `python -m` looks there.
 import importlib.util
 import sys
 from functools import cache
-from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 @cache
-def entry_points() -> tuple[EntryPoint, ...]:
+def entry_points() -> "tuple[EntryPoint, ...]":
     """Those of the group `nsf`, in order of their names; nothing is imported."""
+    from importlib.metadata import distributions  # 0.03 s that most commands need not pay
+
     here = Path.cwd()
     folders = [folder for folder in sys.path if folder and Path(folder).resolve() != here]
     points = (point for one in distributions(path=folders) for point in one.entry_points)
     return tuple(sorted((point for point in points if point.group == "nsf"), key=lambda point: point.name))
 
 
-def entry_point_of(target: str) -> EntryPoint | None:
+def entry_point_of(target: str) -> "EntryPoint | None":
     """The entry point whose module, or package, holds a class by its dotted name."""
     return next((point for point in entry_points() if target.startswith(f"{point.module}.")), None)
 

@@ -11,8 +11,6 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, TextIO
 
-from typing_extensions import override
-
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -70,6 +68,7 @@ def console(stream: TextIO, width: int | None = None) -> "Console":
     """
     from rich.console import Console  # 0.1 s that `nsf --help` need not pay
     from rich.segment import Segment
+    from typing_extensions import override
 
     class OfVisible(Console):
         @override

@@ -130,9 +130,7 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 @lru_cache(maxsize=64)
 def _composed(config_name: str, overrides: tuple[str, ...], sizes: _Sizes) -> bytes:
     """The configuration that Hydra composes of overrides and files, pickled: jobs ask for the same again."""
-    config = _with_values(config_name, overrides, sizes) or _with_hydra(config_name, overrides)
-    OmegaConf.set_readonly(config, False)
-    OmegaConf.set_struct(config, False)
+    config = _unlocked(config_name, overrides, sizes)
     hydra = _of_hydra(config)
     if hydra != _default_hydra():
         changed = [f"hydra.{key}" for key, value in hydra.items() if value != _default_hydra().get(key)]
@@ -144,6 +142,14 @@ def _composed(config_name: str, overrides: tuple[str, ...], sizes: _Sizes) -> by
         )
     del config["hydra"]
     return pickle.dumps(config)
+
+
+def _unlocked(config_name: str, overrides: Sequence[str], sizes: _Sizes) -> DictConfig:
+    """The configuration with Hydra's own part, which takes new keys."""
+    config = _with_values(config_name, overrides, sizes) or _with_hydra(config_name, overrides)
+    OmegaConf.set_readonly(config, False)
+    OmegaConf.set_struct(config, False)
+    return config
 
 
 @contextmanager
@@ -170,15 +176,21 @@ def _with_values(config_name: str, overrides: Sequence[str], sizes: _Sizes) -> D
     """The result of `_with_hydra` in a quarter of the time: values set on options that many jobs share.
 
     None where Hydra refuses the values, so that it says of all overrides together what is wrong.
+
+    Raises:
+        HydraException: a key is missing, of which it would say the same.
     """
     names = groups()
     options = tuple(o for o in overrides if _of_group(o, names))
     config = pickle.loads(_of_groups(config_name, options, sizes))
-    with suppress(HydraException, OmegaConfBaseException, *_OF_BROKEN_FILES):
+    try:
         values = OverridesParser.create().parse_overrides([o for o in overrides if o not in options])
         if not any(value.is_sweep_override() for value in values):
             ConfigLoaderImpl._apply_overrides_to_config(values, config)
             return config
+    except (HydraException, OmegaConfBaseException, *_OF_BROKEN_FILES) as error:
+        if isinstance(error, HydraException) and _missing_key(error):
+            raise
     return None
 
 
@@ -307,7 +319,9 @@ def _unknown(key: str, config_name: str, overrides: Sequence[str]) -> str:
         mapping = any(o.startswith(f"{key}={{") for o in overrides)
         if mapping and OmegaConf.select(_compose(config_name, others), key) is not None:
             return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
-        checked(_compose(config_name, added))
+        config = _unlocked(config_name, added, check_sizes(files()))
+        del config["hydra"]
+        checked(config)
     except ConfigError as error:
         return str(error)
     except HydraException as error:

@@ -12,9 +12,8 @@ import inspect
 import re
 import typing
 from collections.abc import Mapping, Sequence
-from importlib.metadata import EntryPoint
 from types import NoneType, UnionType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from omegaconf import DictConfig
 
@@ -23,6 +22,9 @@ from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError, NSFError, first_line, unknown
 from nsf.installed import entry_point_of
 from nsf.scalars import is_finite, shown
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 class Kind(NamedTuple):
@@ -265,7 +267,7 @@ def _imported(target: str, where: str) -> Any:
     return getattr(imported, name)
 
 
-def _broken(target: str, where: str, point: EntryPoint, error: Exception) -> ConfigError:
+def _broken(target: str, where: str, point: "EntryPoint", error: Exception) -> ConfigError:
     return ConfigError(
         f"{where}: _target_: {target} cannot be imported, {type(error).__name__}: {first_line(error)}; mend "
         f"{point.module}, the entry point {point.name!r} of {point.dist.name}"

@@ -350,8 +350,10 @@ def provenance_rows(runs: Mapping[str, Mapping]) -> Rows:
 
 
 def commit_text(origin: Mapping) -> str:
-    """The commit a run was made at; says so where the tree had uncommitted changes."""
-    commit = str(origin.get("commit") or "no commit")[:12]
+    """The commit a run was made at, or nsf's version; says so where the tree had uncommitted changes."""
+    if not origin.get("commit"):
+        return f"nsf {(origin.get('versions') or {}).get('nsf') or '(version unknown)'}"
+    commit = str(origin["commit"])[:12]
     if origin.get("dirty") is None:
         return f"{commit} (state of the tree unknown)"
     return f"{commit} + uncommitted changes" if origin["dirty"] else commit
