@@ -13,14 +13,14 @@ from nsf.data import Trajectory, TrajectoryWriter
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.gpu import without_collection
-from nsf.pipeline import cores
+from nsf.pipeline import cores, trajectories
 from nsf.pipeline.stages import simulation
 from nsf.progress import Progress
 
 
 def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeypatch):
     """Also while its writer still works: else memory of a GPU is freed while the next captures a graph."""
-    start, append = simulation._start, TrajectoryWriter.append
+    start, append = trajectories._start, TrajectoryWriter.append
     solvers, left, begun = [], [], threading.Event()
 
     def started(job, *rest):
@@ -38,7 +38,7 @@ def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeyp
         assert begun.wait(60)
         append(writer, *args, **fields)
 
-    monkeypatch.setattr(simulation, "_start", started)
+    monkeypatch.setattr(trajectories, "_start", started)
     monkeypatch.setattr(TrajectoryWriter, "append", late)
     with without_collection():  # which would free what holds itself
         pipeline_at(tmp_path).simulate()
