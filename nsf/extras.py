@@ -3,6 +3,7 @@
 import ast
 import importlib
 import sys
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,9 @@ from types import ModuleType
 from typing import Any
 
 from nsf.errors import MissingExtraError
+
+#: When this process began to import nsf, by `time.monotonic` [s].
+STARTED = time.monotonic()
 
 
 def on_first_use(package: str) -> Callable[[str], Any]:

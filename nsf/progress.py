@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, T
 from rich.progress import Progress as RichProgress
 from rich.text import Text
 
+from nsf.extras import STARTED
 from nsf.terminal import console
 
 #: Between two lines of a log [s].
@@ -80,20 +81,30 @@ class Progress:
 
 
 _SECONDS: dict[str, float] = {}  # of this process's stages
+START = "start"
+"""Stands for a stage in `timed`: imports, and all before the first stage."""
 
 
 @contextlib.contextmanager
 def timed(stage: str) -> Iterator[None]:
-    """Count the time of the block as that of a stage."""
+    """Count the time of the block as that of a stage, and not as that of a block around it."""
     begun = time.monotonic()
+    _SECONDS.setdefault(START, begun - STARTED)
+    before = sum(_SECONDS.values())
     try:
         yield
     finally:
-        _SECONDS[stage] = _SECONDS.get(stage, 0.0) + time.monotonic() - begun
+        within = sum(_SECONDS.values()) - before
+        _SECONDS[stage] = _SECONDS.get(stage, 0.0) + time.monotonic() - begun - within
+
+
+def seconds_of(stage: str) -> float:
+    """The time that `timed` has counted for a stage of this process [s]."""
+    return _SECONDS.get(stage, 0.0)
 
 
 def slowest_stage() -> str:
-    """The stages that this process has worked on, and the slowest: `41 s, of which simulate took 17 s`."""
+    """The time of this process's stages, and the slowest: `41 s, of which simulate took 17 s`."""
     if not _SECONDS:
         return ""
     name = max(_SECONDS, key=_SECONDS.__getitem__)

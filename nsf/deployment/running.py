@@ -16,34 +16,44 @@ from nsf.timing import synchronizer
 
 #: Cases and device name → their runs at t = 0.
 BatchAt = Callable[[Sequence[Case], str], ReducedBatch]
+Stepped = Callable[[], object]
+"""Called when a batch has taken its first step."""
 
 
 class Deployment(pl.LightningModule):
     """Runs the cases of a batch from t = 0 to T in its prediction step; they take their steps together.
 
     Args:
-        batch_at, cases, trust: as for `deploy`.
+        batch_at, cases, trust, stepped: as for `deploy`.
         progress: advances with each run.
 
     Attributes:
         rollouts: of the cases so far; Lightning would take apart what a step returns.
     """
 
-    def __init__(self, batch_at: BatchAt, cases: Sequence[Case], trust: Trust, progress: Progress):
+    def __init__(
+        self, batch_at: BatchAt, cases: Sequence[Case], trust: Trust, stepped: Stepped, progress: Progress
+    ):
         super().__init__()
         self._batch_at, self._cases, self._trust, self._progress = batch_at, cases, trust, progress
+        self._stepped = stepped
         self.rollouts: list[Rollout] = []
 
     def predict_step(self, indices: list[int], batch_idx: int) -> int:
         """Run the cases of some indices; returns how many."""
         cases = [self._cases[index] for index in indices]
-        self.rollouts += rollouts(self._batch_at(cases, str(self.device)), cases, self._trust)
+        self.rollouts += rollouts(self._batch_at(cases, str(self.device)), cases, self._trust, self._stepped)
         self._progress.advance(len(cases))
         return len(cases)
 
 
 def deploy(
-    batch_at: BatchAt, cases: Sequence[Case], device: str, trust: Trust, batch: int = 1
+    batch_at: BatchAt,
+    cases: Sequence[Case],
+    device: str,
+    trust: Trust,
+    batch: int = 1,
+    stepped: Stepped = lambda: None,
 ) -> list[Rollout]:
     """Reduced runs of every case, with a progress bar.
 
@@ -53,6 +63,7 @@ def deploy(
         device: `cpu`, `cuda` or `cuda:N`.
         trust: bounds the errors of the runs.
         batch: most cases that take their steps together.
+        stepped: called after the first step of each batch.
 
     Raises:
         KeyboardInterrupt: on an interrupt.
@@ -61,20 +72,23 @@ def deploy(
     # torch's inference tensors could not be updated in place between steps.
     options = {"logger": False, "inference_mode": False}
     with Progress("deploy", len(cases), "runs") as progress, trainer_on(device, **options) as trainer:
-        deployment = Deployment(batch_at, cases, trust, progress)
+        deployment = Deployment(batch_at, cases, trust, stepped, progress)
         trainer.predict(deployment, loader, return_predictions=False)
     return deployment.rollouts
 
 
-def rollouts(batch: ReducedBatch, cases: Sequence[Case], trust: Trust) -> list[Rollout]:
+def rollouts(
+    batch: ReducedBatch, cases: Sequence[Case], trust: Trust, stepped: Stepped = lambda: None
+) -> list[Rollout]:
     """Run a batch to the end of its scene.
 
     Args:
         batch: at t = 0.
         cases: problem parameters of each run, for the record.
         trust: bounds the errors of the runs.
+        stepped: called after the first step.
     """
-    share = _timed_run(batch) / len(batch)
+    share = _timed_run(batch, stepped) / len(batch)
     return [_rollout_of(run, case, trust, share) for run, case in zip(batch.runs, cases, strict=True)]
 
 
@@ -99,11 +113,12 @@ def _rollout_of(run: ReducedMPM, case: Case, trust: Trust, seconds: float) -> Ro
     )
 
 
-def _timed_run(batch: ReducedBatch) -> float:
+def _timed_run(batch: ReducedBatch, stepped: Stepped) -> float:
     """Take every step; gives their time [s], the first, which compiles, as the mean of the others."""
     batch.step(1)
     wait = synchronizer(batch.device)
     wait()
+    stepped()
     started, steps = time.perf_counter(), batch.total_steps
     batch.step(steps - 1)
     wait()

@@ -24,6 +24,7 @@ from nsf.models.drawn import Drawn
 from nsf.paths import option
 from nsf.pipeline import naming
 from nsf.pipeline.configured import Configured
+from nsf.progress import START, timed
 from nsf.results.folder import check_place
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
@@ -306,7 +307,8 @@ class Pipeline(Configured):
         for line in warned:
             self.say(f"simulate: warning: {line}")
         if missing := {run for run in runs if run not in there and run not in needless}:
-            from nsf.pipeline.stages.simulation import simulate_missing
+            with timed(START):
+                from nsf.pipeline.stages.simulation import simulate_missing
 
             self.check()
             simulate_missing(self, missing, warned)
@@ -397,7 +399,9 @@ class Pipeline(Configured):
             with run.claimed(self.say):
                 if not run.complete:
                     module, _, function = work.partition(".")
-                    getattr(import_module(f"nsf.pipeline.stages.{module}"), function)(self, run)
+                    with timed(START):
+                        make = getattr(import_module(f"nsf.pipeline.stages.{module}"), function)
+                    make(self, run)
                     return run
         self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
         return run

@@ -45,7 +45,7 @@ _MEANS = (
     *("displacement_error", "displacement_worst", "stress_error", *RIVALS, "delta_static"),
     *("gamma", "sample", "integration_share", "step_ms_full", "step_ms", "total_ms", "decode_ms"),
     *("speedup_step", "speedup_total", "speedup_decoded", "memory_full_mib", "memory_mib"),
-    *("train_seconds", "teach_seconds", "break_even_runs", "fallback_share"),
+    *("train_seconds", "teach_seconds", "ready_seconds", "break_even_runs", "fallback_share"),
 )
 _EACH = (
     *("body", "variant", "seed", "sampler.seed", "case", "delta", "displacement_error", "stress_error"),

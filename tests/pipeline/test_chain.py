@@ -102,6 +102,7 @@ def test_results_have_the_columns_of_a_report(chain):
     assert row["step_ms_p10"] <= row["step_ms"] <= row["step_ms_p90"]
     assert 0 < row["distance"] < row["distance_max"] < 0.02
     assert row["decode_ms"] > 0
+    assert row["ready_seconds"] > 0
     assert row["displacement_static"] == 1.0
     assert 0 < row["displacement_interpolated"] < row["displacement_nearest"] < 1.0
     assert 0.01 < row["displacement_coarse"] < 0.6

@@ -4,11 +4,17 @@ from nsf import progress
 
 
 def test_the_slowest_stage_is_named(monkeypatch):
-    now = iter([0.0, 2.0, 2.0, 5.0, 5.0, 6.5])
+    now = iter([1.0, 3.0, 3.0, 4.0, 5.0, 6.0, 6.0, 7.5])
     monkeypatch.setattr(progress, "_SECONDS", {})
+    monkeypatch.setattr(progress, "STARTED", 0.0)
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
     assert progress.slowest_stage() == ""
-    for stage in ("simulate", "train", "simulate"):
-        with progress.timed(stage):
-            pass
-    assert progress.slowest_stage() == "6.5 s, of which simulate took 3.5 s"
+    with progress.timed("simulate"):
+        pass
+    with progress.timed("train"), progress.timed(progress.START):
+        pass
+    with progress.timed("simulate"):
+        pass
+    assert progress.seconds_of("train") == 2.0
+    assert progress.seconds_of(progress.START) == 2.0
+    assert progress.slowest_stage() == "7.5 s, of which simulate took 3.5 s"

@@ -1,6 +1,7 @@
 """The stage `deploy`: reduced runs of the held-out cases, bounds of their errors, and who takes red ones."""
 
 import shutil
+import time
 from collections.abc import Sequence
 from functools import partial
 
@@ -30,6 +31,7 @@ from nsf.models import Auto, FullOrder, Projected
 from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
 from nsf.pipeline.stages.calibration import CALIBRATES, calibrated
 from nsf.pipeline.stages.choosing import measure_candidates
+from nsf.progress import START, seconds_of
 from nsf.runs import Record, Run
 from nsf.storage import writing
 
@@ -46,6 +48,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
     """
     warn_of_step(pipeline)
     measured = measure_candidates(pipeline) if isinstance(pipeline.configured, Auto) else []
+    begun = time.monotonic()
     manifold = pipeline.manifold().to(pipeline.device)  # many solvers take their rows from it
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
         record.metrics |= {"model": pipeline.model.name, "candidates": [one.plain for one in measured]}
@@ -62,7 +65,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
             record.metrics |= {"engine": "full", "engine_why": "", "batch": 1}
             rollouts = _full_order(pipeline, manifold, pipeline.held_out, trust.limit)
         else:
-            rollouts = _first_runs(pipeline, manifold, trust, record)
+            rollouts = _first_runs(pipeline, manifold, trust, record, begun)
             rollouts = _taken_over(pipeline, manifold, rollouts)
         for index, rollout in enumerate(rollouts):
             rollout.save(record.path / rollout_file(index))
@@ -107,8 +110,8 @@ def write_configuration(pipeline, record: Record) -> None:
     record.output(CONFIGURATION)
 
 
-def _first_runs(pipeline, manifold: Manifold, trust: Trust, record: Record) -> list[Rollout]:
-    """The reduced runs of the configured model."""
+def _first_runs(pipeline, manifold: Manifold, trust: Trust, record: Record, begun: float) -> list[Rollout]:
+    """The reduced runs of the configured model, of a stage that was begun at a time of the clock [s]."""
     # Runs that take their steps together share the time of these equally.
     together = record.metrics["batch"] = min(pipeline.config.deploy.batch, len(pipeline.held_out))
 
@@ -117,7 +120,10 @@ def _first_runs(pipeline, manifold: Manifold, trust: Trust, record: Record) -> l
         record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
         return batch
 
-    rollouts = deploy(batch_at, pipeline.held_out, pipeline.device, trust, together)
+    def stepped() -> None:
+        record.metrics.setdefault("ready_seconds", seconds_of(START) + time.monotonic() - begun)
+
+    rollouts = deploy(batch_at, pipeline.held_out, pipeline.device, trust, together, stepped)
     engine, why = record.metrics["engine"], record.metrics["engine_why"]
     if isinstance(pipeline.model, Projected):
         pipeline.say(f"deploy: steps by {engine}" + (f", since {why}" if why else ""))

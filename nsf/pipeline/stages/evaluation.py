@@ -1,6 +1,7 @@
 """The stages `evaluate` and `superresolve`: reduced runs held to full-order ones, and their costs."""
 
 import contextlib
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import FULL_ORDER, PROJECTED, TRUST, Rollout, Trust, continuation_file, rollout_file
 from nsf.dynamics.setup import reduced_steps
+from nsf.errors import SchemaError
 from nsf.evaluation import (
     Comparison,
     Rivals,
@@ -60,6 +62,7 @@ def evaluate(pipeline, run: Run) -> None:
         offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
         origin = cost, pipeline.device, run.manifest, pipeline.model.name, offline
         table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *origin)
+        table["ready_seconds"] = _ready(pipeline.deployment) if cost["trials"] else math.nan
         table["beyond"] = _beyond(pipeline, manifold, rollouts, comparisons)
         summary = results.summarise(pipeline.config, comparisons, beside, rollouts, seconds)
         results.write(record, table, comparisons, cost, summary)
@@ -123,6 +126,13 @@ def _beyond(pipeline, manifold: Manifold, rollouts, comparisons: Sequence[Compar
         int(beyond(pipeline, trust, rollout.case, comparison.series[names].to_numpy()))
         for rollout, comparison in zip(rollouts, comparisons, strict=True)
     ]
+
+
+def _ready(deployment: Run) -> float:
+    """Time from the command to the first step of a deployed run [s]; NaN of full-order runs."""
+    with contextlib.suppress(SchemaError):
+        return deployment.metric("ready_seconds")
+    return math.nan
 
 
 def _took(pipeline, rollout: Rollout) -> str | None:
