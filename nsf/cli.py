@@ -264,11 +264,13 @@ def _reports(arguments: list[str]) -> int:
 def _search(arguments: list[str]) -> int:
     """Trials until there are enough, and the best of them."""
     words.check("search", arguments)
-    from nsf.pipeline.search import search
+    from nsf.pipeline.search import best, search
     from nsf.results.search import best_table
 
     chart = search(arguments)
-    screen().print(best_table(chart.with_name("trials.csv")))
+    trials = chart.with_name("trials.csv")
+    screen().print(best_table(trials))
+    print(best(arguments, trials))
     return _open(chart)
 
 
@@ -329,10 +331,12 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
     stages = (*(s for s in _stages(stage) if s != "report"), *more)
     failed = sweep(sweeps, stages, launcher, usage.primary(stage))
     if "evaluate" in stages:
-        from nsf.pipeline.outcome import outcome_table
+        from nsf.pipeline.outcome import outcome
+        from nsf.results.formats import terminal_table
 
-        if table := outcome_table(sweeps, {" ".join(failure.job): failure.error for failure in failed}):
-            screen().print(table)
+        if ended := outcome(sweeps, {" ".join(failure.job): failure.error for failure in failed}):
+            screen().print(terminal_table(ended[0]))
+            print(ended[1])
     for failure in failed:
         print(f"failed: {failure}", file=sys.stderr)
     return 2 if failed else 0

@@ -1,24 +1,26 @@
-"""The outcome of each job of a sweep, in a table over the keys that it varied."""
+"""The outcome of each job of a sweep: a table over the keys that it varied, and the best job."""
 
-import csv
+import math
+import shlex
 from collections.abc import Mapping, Sequence
-from statistics import fmean
-
-from rich.markup import escape
-from rich.table import Table
+from typing import Any
 
 from nsf import config as configuration
 from nsf.errors import MissingRunError
 from nsf.pipeline.chain import Pipeline
-from nsf.results.columns import COLUMNS
-from nsf.runs import Run
+from nsf.results.columns import COLUMNS, axis, number
+from nsf.results.formats import Rows
 
-#: Columns of `results.csv` of which a job's mean is shown.
-_SHOWN = ("delta", "displacement_error", "stress_error", "step_ms_full", "step_ms")
+#: Metrics of an evaluate run that are shown: means over its cases.
+_ERRORS = ("displacement_error", "stress_error", "delta")
+_TIMES = ("step_ms_full", "step_ms")
+_VALIDATION = "validation_error"
 
 
-def outcome_table(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> Table | None:
-    """A row a job; None where there is only one.
+def outcome(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> tuple[Rows, str] | None:
+    """A row a job, and which one is best, with its command; None where there is only one job.
+
+    Jobs of several scenes, or without validation values, have no best.
 
     Args:
         sweeps: overrides whose keys may have several values.
@@ -29,26 +31,56 @@ def outcome_table(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) ->
     varied = [key for key in keys if len({job.get(key) for job in jobs}) > 1]
     if len(jobs) < 2 or not varied:
         return None
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    leaves = [key.split(".")[-1] for key in varied]
-    for key, leaf in zip(varied, leaves, strict=True):
-        table.add_column(escape(leaf if leaves.count(leaf) == 1 else key), overflow="fold")
-    for name in _SHOWN:
-        table.add_column(escape(COLUMNS[name].heading), justify="right")
-    table.add_column("run", no_wrap=True)
-    for job in jobs:
-        setting = " ".join(f"{key}={job[key]}" for key in keys if key in varied and key in job)
-        try:
-            run = Pipeline(configuration.load([f"{key}={value}" for key, value in job.items()])).evaluated()
-            cells = [*_means(run), run.hash]
-        except MissingRunError:
-            cells = [""] * len(_SHOWN) + ["failed" if setting in failed else "not evaluated"]
-        table.add_row(*(escape(job.get(key, "")) for key in varied), *map(escape, cells))
-    return table
+    tells = [_words({key: job[key] for key in keys if key in varied and key in job}) for job in jobs]
+    results = [_result(_words(job)) for job in jobs]
+    for setting, result in zip(tells, results, strict=True):
+        if "run" not in result:
+            result["run"] = "failed" if " ".join(setting) in failed else "not evaluated"
+    leaves = [key.rpartition(".")[2] for key in varied]
+    names = [leaf if leaves.count(leaf) == 1 else key for key, leaf in zip(varied, leaves, strict=True)]
+    shown = [COLUMNS[name] for name in (*_ERRORS, *_TIMES)]
+    headings = [*names, *(one.heading for one in shown), axis("validation error", "%"), "run"]
+    body = [
+        [
+            *(job.get(key, "") for key in varied),
+            *(one.cell(result.get(one.name)) for one in shown),
+            number(result.get(_VALIDATION), 100),
+            result["run"],
+        ]
+        for job, result in zip(jobs, results, strict=True)
+    ]
+    rows = Rows(headings, body, [False] * len(varied) + [True] * (len(shown) + 1) + [False])
+    validated = [at for at, result in enumerate(results) if _VALIDATION in result]
+    if "scene" in varied or not validated:
+        return rows, ""
+    best = min(validated, key=lambda at: results[at][_VALIDATION])
+    score = f"displacement error {number(results[best][_VALIDATION], 100)} %"
+    return rows, best_text(score, tells[best], _words(jobs[best]))
 
 
-def _means(run: Run) -> list[str]:
-    """Cells of a job: means over its cases. Without pandas, whose import takes as long as a chain reused."""
-    with run.file("results.csv").open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    return [COLUMNS[name].cell(fmean(float(row[name] or "nan") for row in rows)) for name in _SHOWN]
+def best_text(score: str, setting: Sequence[str], words: Sequence[str]) -> str:
+    """Which job is best at the validation values, and the command that deploys it.
+
+    Args:
+        score: there, with its name and unit.
+        setting: overrides that tell the job apart.
+        words: all its overrides.
+    """
+    return (
+        f"best at the validation values, {score}: {' '.join(setting)}\n{shlex.join(['nsf', 'run', *words])}"
+    )
+
+
+def _words(keys: Mapping[str, str]) -> list[str]:
+    return [f"{key}={value}" for key, value in keys.items()]
+
+
+def _result(words: Sequence[str]) -> dict[str, Any]:
+    """Metrics of a job's evaluate run, ∞ for errors of runs that diverged, and its hash; empty without it."""
+    try:
+        run = Pipeline(configuration.load(words)).evaluated()
+    except MissingRunError:
+        return {}
+    metrics = run.manifest["metrics"]
+    lost = dict.fromkeys(_ERRORS, math.inf) if metrics.get("diverged") else {}
+    return lost | {name: value for name, value in metrics.items() if value is not None} | {"run": run.hash}

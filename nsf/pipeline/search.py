@@ -14,8 +14,9 @@ from nsf.canonical import content_hash
 from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, first_line
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
+from nsf.pipeline.outcome import best_text
 from nsf.results.search import OBJECTIVES, write_search
-from nsf.results.table import read
+from nsf.results.table import parsed, read
 from nsf.storage import locked
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -109,6 +110,23 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
         raise MissingRunError("no trial of this search has a result; the lines above say why")
     folder = Path(config.report.folder) / f"search_{study.study_name}"
     return write_search(table, objectives, folder)
+
+
+def best(words: Sequence[str], trials: Path) -> str:
+    """The trial of the smallest first objective at the validation values, and the command that deploys it.
+
+    Args:
+        words: as of `search`; trials: the `trials.csv` that it wrote.
+    """
+    ranges, fixed = _parted(words)
+    table = parsed(trials, [r.key for r in ranges])
+    name = next(name for name in OBJECTIVES if name in table)
+    row = table.loc[table[name].idxmin()]
+    tried = [f"{r.key}={row[r.key]}" for r in ranges]
+    kept = [word for word in fixed if not word.startswith("search.")]
+    column = OBJECTIVES[name]
+    score = f"{column.title} {column.cell(row[name])} {column.unit}"
+    return best_text(score, tried, [*kept, *tried])
 
 
 def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:

@@ -10,9 +10,8 @@ from rich.markup import escape
 from nsf import progress
 from nsf.cli import main
 from nsf.config import load
-from nsf.errors import SchemaError
 from nsf.pipeline import Pipeline, preview
-from nsf.pipeline.outcome import outcome_table
+from nsf.pipeline.outcome import outcome
 from nsf.progress import Progress, label, labelled
 from nsf.scenes.resolution import resolution_warnings
 
@@ -160,17 +159,23 @@ def test_a_log_tells_of_work_that_has_not_begun(monkeypatch, capsys):
     assert capsys.readouterr().err == "train, 0 of 10 steps, 0.0/s\n"
 
 
-def test_a_sweep_ends_with_a_table_over_what_it_varied(chain, tiny, monkeypatch, tmp_path):
+def test_a_sweep_ends_with_a_table_over_what_it_varied(chain, tiny, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(chain.root))
     words = [word for word in tiny if not word.startswith("latent_dim")]
-    table = outcome_table([[*words, "latent_dim=4,3"]], {"latent_dim=3": "lost"})
-    columns = {column.header: list(column.cells) for column in table.columns}
-    assert columns["latent_dim"] == ["4", "3"]
-    assert columns["run"] == [chain.pipeline.evaluation.hash, "failed"]
-    assert float(columns[r"δ \[%]" if r"δ \[%]" in columns else "δ [%]"][0]) > 0
-    assert outcome_table([list(tiny)], {}) is None
-    results = tmp_path / "results.csv"
-    results.write_text("scene,model,case,split,delta\nsand,projected,a=1,test,abc\n")
-    monkeypatch.setattr(Pipeline, "evaluated", lambda _: SimpleNamespace(file=lambda _: results, hash="0"))
-    with pytest.raises(SchemaError, match="delta holds text"):
-        outcome_table([[*words, "latent_dim=4,3"]], {})
+    rows, best = outcome([[*words, "latent_dim=4,3"]], {"latent_dim=3": "lost"})
+    columns = dict(zip(rows.headings, zip(*rows.body, strict=True), strict=True))
+    assert columns["latent_dim"] == ("4", "3")
+    assert columns["run"] == (chain.pipeline.evaluation.hash, "failed")
+    assert float(columns["displacement error [%]"][0]) > 0
+    assert best == ""  # without validation values
+    assert outcome([list(tiny)], {}) is None
+
+    def evaluated(pipeline):
+        metrics = {"delta": 0.1, "validation_error": 0.01 * pipeline.config.latent_dim}
+        return SimpleNamespace(hash="0", manifest={"metrics": metrics})
+
+    monkeypatch.setattr(Pipeline, "evaluated", evaluated)
+    _, best = outcome([[*words, "latent_dim=4,3"]], {})
+    assert "3 %" in best.splitlines()[0]
+    assert best.splitlines()[1].startswith("nsf run ")
+    assert best.endswith("latent_dim=3")

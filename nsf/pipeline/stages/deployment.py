@@ -56,6 +56,8 @@ def deploy_held_out(pipeline, run: Run) -> None:
         trust.save(record.path / TRUST)
         record.output(TRUST)
         runs = len(trust.calibration.errors) if trust.calibration else 0
+        if runs and not trust.calibration.lost:
+            record.metrics["validation_error"] = float(trust.calibration.errors.mean())
         if 0 < runs < ENOUGH:
             pipeline.say(
                 f"deploy: {runs} validation run{'s' * (runs > 1)} set the error bounds, which are "

@@ -66,6 +66,8 @@ def evaluate(pipeline, run: Run) -> None:
         table["beyond"] = _beyond(pipeline, manifold, rollouts, comparisons)
         summary = results.summarise(pipeline.config, comparisons, beside, rollouts, seconds)
         results.write(record, table, comparisons, cost, summary)
+        if (error := pipeline.deployment.manifest["metrics"].get("validation_error")) is not None:
+            record.metrics["validation_error"] = error
     pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} cases → {run.id}")
 
 
