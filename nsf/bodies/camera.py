@@ -63,14 +63,19 @@ class View:
 
     @classmethod
     def around(
-        cls, x: np.ndarray, width: int, camera: Camera | None = None, solids: np.ndarray | None = None
+        cls,
+        x: np.ndarray,
+        width: int,
+        camera: Camera | None = None,
+        solids: np.ndarray | None = None,
+        radius: float = 0.0,
     ) -> "View":
-        """The window that holds every point of x [..., 3] and, within reason, those of `solids` [k, 3]."""
+        """The window of all balls of a radius [m] about x [..., 3] and, within reason, of `solids` [k, 3]."""
         points = x.reshape(-1, 3)
         points = points[np.isfinite(points).all(axis=1)]
         camera = camera or Camera.facing(points)
         flat = camera.project(points)[:, :2]
-        low, high = flat.min(axis=0), flat.max(axis=0)
+        low, high = flat.min(axis=0) - radius, flat.max(axis=0) + radius
         reach = _BEYOND * max(high - low)
         if solids is not None and len(solids):
             seen = camera.project(solids)[:, :2]

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import matplotlib
 import numpy as np
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import Normalize, PowerNorm, to_rgb
 
 STRESS_COLORS, DIFFERENCE_COLORS, SIGNED_COLORS = "viridis", "magma", "coolwarm"
 CLIP = 93.0  # [%] percentile of the full-order stress at which the colour scale ends
@@ -26,21 +26,32 @@ class ColorScale:
         factor, unit: of what is written beside it.
         signed: it begins at −top instead of 0.
         title: of the quantity.
+        power: of the share of `top` that a colour stands for; below 1 it parts small values.
     """
 
     def __init__(
-        self, top: float, cmap: str, factor: float, unit: str, signed: bool = False, title: str = ""
+        self,
+        top: float,
+        cmap: str,
+        factor: float,
+        unit: str,
+        signed: bool = False,
+        title: str = "",
+        power: float = 1.0,
     ):
         self.factor, self.unit, self.top, self.title = factor, unit, top, title
         bottom = -top / factor if signed else 0.0
-        self.mappable = ScalarMappable(Normalize(bottom, top / factor), matplotlib.colormaps[cmap])
+        scale = Normalize(bottom, top / factor) if power == 1.0 else PowerNorm(power, bottom, top / factor)
+        self.mappable = ScalarMappable(scale, matplotlib.colormaps[cmap])
 
     @classmethod
-    def up_to(cls, top: float, cmap: str, units, signed: bool = False, title: str = "") -> "ColorScale":
+    def up_to(
+        cls, top: float, cmap: str, units, signed: bool = False, title: str = "", power: float = 1.0
+    ) -> "ColorScale":
         """`top` in SI; the largest unit in which it is no less than 0.3 is taken."""
         top = float(top) if np.isfinite(top) and top > 0 else units[-1][0]
         factor, unit = next(((f, u) for f, u in units if top >= 0.3 * f), units[-1])
-        return cls(top, cmap, factor, unit, signed, title)
+        return cls(top, cmap, factor, unit, signed, title, power)
 
     @property
     def label(self) -> str:

@@ -56,24 +56,26 @@ class Stage:
     Args:
         bodies: all that are shown.
         cut: whether the front half is cut away; not of a thin body, which hides nothing inside.
+        shown: frames that are; some of all by default.
     """
 
-    def __init__(self, bodies: Sequence[Body], cut: bool = False):
+    def __init__(self, bodies: Sequence[Body], cut: bool = False, shown: Sequence[int] | None = None):
         self._solids = {id(body): Solids(body.around, body.x[0].mean(axis=0, dtype=float)) for body in bodies}
         self._radius = {id(body): body.radius or _radius(body.x[0]) for body in bodies}
-        frames = [(body, k) for body in bodies for k in spaced(len(body.x), _LOOKS)]
-        seen = [self._placed(body, k) for body, k in frames]
-        self.camera = Camera.facing(seen[0])
-        self._cut = cut and is_cut_open(seen[0])
-        self._middle = seen[0].mean(axis=0, dtype=float)
+        frames = [
+            (body, k) for body in bodies for k in (spaced(len(body.x), _LOOKS) if shown is None else shown)
+        ]
+        seen, rest = [self._placed(body, k) for body, k in frames], self._placed(bodies[0], 0)
+        self.camera = Camera.facing(rest)
+        self._cut = cut and is_cut_open(rest)
+        self._middle = rest.mean(axis=0, dtype=float)
         # How far the ground of every body goes on: as far as any of them comes.
         reach = self._solids[id(bodies[0])].reach(seen)
         for solids in self._solids.values():
             solids.reached = reach
         faces = [face.corners for body, k in frames for face in self._faces(body, k)]
-        self._window = View.around(
-            np.concatenate(seen), 100, self.camera, np.concatenate(faces) if faces else None
-        )
+        corners, radius = np.concatenate(faces) if faces else None, max(self._radius.values())
+        self._window = View.around(np.concatenate(seen), 100, self.camera, corners, radius)
 
     def view(self, width: int) -> View:
         """The window, so many pixels wide."""
@@ -116,7 +118,7 @@ def strip(bodies: Sequence[Body], t: np.ndarray, count: int = 5, cut: bool = Fal
         cut: whether the front half is cut away.
     """
     chosen = spaced(len(t), count)
-    stage, titles = Stage(bodies, cut), [f"t = {t[k]:.3g} s" for k in chosen]
+    stage, titles = Stage(bodies, cut, chosen), [f"t = {t[k]:.3g} s" for k in chosen]
     sheet = _sheet(stage, [[body] * len(chosen) for body in bodies], titles, WIDE)
     for row, body in enumerate(bodies):
         for column, k in enumerate(chosen):
@@ -132,7 +134,7 @@ def grid(rows: Sequence[Sequence[Body]], titles: Sequence[str], cut: bool = Fals
         titles: of the columns.
         cut: whether the front half is cut away.
     """
-    stage = Stage([body for row in rows for body in row], cut)
+    stage = Stage([body for row in rows for body in row], cut, [-1])
     width = round(WIDE * 5 / (len(titles) + 1))
     sheet = _sheet(stage, rows, titles, width)
     for i, row in enumerate(rows):

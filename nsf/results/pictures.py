@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 
 from nsf import bodies
 from nsf.bodies import Body, Categories, ColorScale
-from nsf.bodies.colors import CLIP, DIFFERENCE_COLORS, METRES, PASCALS, ROLES, STRESS_COLORS
+from nsf.bodies.colors import DIFFERENCE_COLORS, METRES, PASCALS, ROLES, STRESS_COLORS
 from nsf.bodies.film import GIF_BYTES
 from nsf.results.charts import best
-from nsf.results.columns import BASELINE, model_name
+from nsf.results.columns import BASELINE, model_name, number
 from nsf.results.page import Picture, Section
 from nsf.results.sources import Motion, Source, checked_hash
 from nsf.results.style import save
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _ROWS, _ENDS = 6, 2  # cases of final shapes, and of strips and films
 _FILMS = 6 * 2**20  # [bytes] of all on a page
 _MANY = 16  # bodies and models beyond which each has only its strip
+_TOP = 99.0  # [%] percentile at which a colour scale ends
 _FINE = "superresolution.png"
 _STRESS = "von Mises equivalent of the Kirchhoff stress"
 _SETS = dict(zip(("in neither", "integration particles N", "sample particles S"), ROLES, strict=True))
@@ -50,37 +51,35 @@ class Shown:
         motion: of the full-order run and of the model.
         model: the model's name.
         place: "worst" or "best" of several cases, a setting, or nothing.
-        delta: δ as a fraction.
+        error: of displacement, a fraction.
         baseline: the same case by the baseline, where it is shown beside.
     """
 
     motion: Motion
     model: str
     place: str = ""
-    delta: float = math.nan
+    error: float = math.nan
     baseline: Motion | None = None
 
     @property
     def name(self) -> str:
-        """The case, its place and its δ."""
-        delta = [f"δ {100 * self.delta:.2g} %"] if math.isfinite(self.delta) else []
-        return ", ".join(filter(None, (self.motion.case.replace("_", " "), self.place, *delta)))
+        """The case, its place and its error."""
+        error = f"displacement error {number(self.error, 100)} %" if math.isfinite(self.error) else ""
+        return ", ".join(filter(None, (self.motion.case.replace("_", " "), self.place, error)))
 
     def rows(self, scale: ColorScale) -> Iterator[tuple[str, Body]]:
         """Each model's name and body."""
         m, b = self.motion, self.baseline
 
-        def body(model: str, x, stress, stopped: float | None = None) -> Body:
-            return Body(x, stress, scale, m.surroundings, f"{model}, {self.name}", _warning(stopped))
+        case = m.case.replace("_", " ")
 
-        yield "full order", body("full order", m.x_full, m.stress_full)
-        yield self.model, body(self.model, m.x_reduced, m.stress_reduced, m.stopped)
+        def body(model: str, name: str, x, stress, stopped: float | None = None) -> tuple[str, Body]:
+            return model, Body(x, stress, scale, m.surroundings, f"{model}, {name}", _warning(stopped))
+
+        yield body("full order", case, m.x_full, m.stress_full)
+        yield body(self.model, self.name, m.x_reduced, m.stress_reduced, m.stopped)
         if b is not None:
-            text = f"{BASELINE}, {m.case.replace('_', ' ')}"
-            yield (
-                BASELINE,
-                Body(b.x_reduced, b.stress_reduced, scale, m.surroundings, text, _warning(b.stopped)),
-            )
+            yield body(BASELINE, case, b.x_reduced, b.stress_reduced, b.stopped)
 
 
 def sections(
@@ -136,14 +135,16 @@ def _of_variant(
     runs = sorted({of_model["run"].iloc[0], *of_baseline["run"]})
     over = "cut open" if hides_stress(ends[0].motion) else "whole"
     caption = f"Bodies over time, {over}: full order, {ends[0].model}"
-    caption += f", {BASELINE}." if ends[0].baseline is not None else "."
+    caption += f", {BASELINE}" if ends[0].baseline is not None else ""
+    caption += f". Colour: {_STRESS}. Displacement error of {ends[0].model}: {_errors(ends)}."
     pictures = [Picture(save(strip(ends), folder, f"{stem}strip", ("png",), [STRESS_COLORS]), caption, runs)]
     if not whole:
         return pictures
     every = sorted(cases(of_model, of_baseline, sources, _ROWS), key=lambda case: natural(case.motion.case))
     ramps = [STRESS_COLORS, DIFFERENCE_COLORS]
     final = save(final_shapes(every), folder, f"{stem}final-shapes", ("png",), ramps)
-    caption = "The last frame of each case, and how far each particle lies from the full-order run's."
+    caption = "The last frame of each case, and how far each particle lies from the full-order run's. "
+    caption += f"Displacement error: {_errors(every)}."
     pictures.append(Picture(final, caption, runs))
     if ends[-1].motion.role is not None:
         sets = save(particle_sets(ends[-1]), folder, f"{stem}particle-sets", ("png",))
@@ -154,6 +155,13 @@ def _of_variant(
         caption = f"Full order beside {ends[0].model}."
         pictures.append(Picture([f"{stem}animation.gif"], caption, runs))
     return pictures
+
+
+def _errors(cases: Sequence[Shown]) -> str:
+    """The displacement errors of cases, or the smallest and the largest."""
+    errors = sorted(case.error for case in cases)
+    ends = [number(errors[0], 100), number(errors[-1], 100)]
+    return f"{' to '.join(dict.fromkeys(ends))} %"
 
 
 def _settings(frame: pd.DataFrame, sources: Mapping[str, Source], folder: Path) -> list[Picture]:
@@ -170,7 +178,8 @@ def _settings(frame: pd.DataFrame, sources: Mapping[str, Source], folder: Path) 
             place = part["variant"].iloc[0] if len(part) else ""
             motions = _motions(part, [worst], sources) if len(part) else {}
             shown += [
-                Shown(m, model_name(part.iloc[0]), place, part["delta"].iloc[0]) for m in motions.values()
+                Shown(m, model_name(part.iloc[0]), place, part["displacement_error"].iloc[0])
+                for m in motions.values()
             ]
         if len(shown) > 1:
             stem = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', str(body))}-settings"
@@ -196,7 +205,7 @@ def cases(
         if other is not None and (len(other.t) != len(motion.t) or row["model_name"] == BASELINE):
             other = None
         place = place if len(ranked) > 1 else ""
-        shown.append(Shown(motion, model_name(row), place, row["delta"], other))
+        shown.append(Shown(motion, model_name(row), place, row["displacement_error"], other))
     return shown
 
 
@@ -229,7 +238,7 @@ def final_shapes(cases: Sequence[Shown]) -> Figure:
     stress = _stress_scale([m.stress_full[-1] for m in motions])
     apart = [np.linalg.norm(m.x_reduced - m.x_full, axis=-1)[ends] for m in motions]
     finite = np.concatenate([d[-1][np.isfinite(d[-1])] for d in apart])
-    top = np.percentile(finite, 99.5) if len(finite) else 0.0
+    top = np.percentile(finite, _TOP) if len(finite) else 0.0
     distance = ColorScale.up_to(top, DIFFERENCE_COLORS, METRES, title="distance ‖x_rom − x_fom‖")
     rows = []
     for case, m, d in zip(cases, motions, apart, strict=True):
@@ -259,7 +268,7 @@ def fine_shapes(fine: list["SuperResolution"], around: Sequence[Mapping]) -> Fig
     """
     distances = np.linalg.norm(fine[0].x_full - fine[0].X, axis=1)
     moved = ColorScale.up_to(
-        np.percentile(distances[np.isfinite(distances)], 99.5), STRESS_COLORS, METRES,
+        np.percentile(distances[np.isfinite(distances)], _TOP), STRESS_COLORS, METRES,
         title="displacement ‖x − X‖",
     )  # fmt: skip
     rows = []
@@ -345,5 +354,5 @@ def _at(around: Mapping[str, np.ndarray], frames: list[int]) -> dict[str, np.nda
 
 
 def _stress_scale(values: Sequence[np.ndarray]) -> ColorScale:
-    top = np.percentile(np.concatenate([one.ravel() for one in values]), CLIP)
-    return ColorScale.up_to(top, STRESS_COLORS, PASCALS, title=_STRESS)
+    top = np.percentile(np.concatenate([one.ravel() for one in values]), _TOP)
+    return ColorScale.up_to(top, STRESS_COLORS, PASCALS, title=_STRESS, power=0.5)

@@ -78,6 +78,7 @@ _RC = {
 WIDTH = 9.6  # [inch] 960 px at 100 dpi: the width of a report's column
 PIXELS = 120  # an inch of a png: sharp at that width, and a report of many pictures stays small
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
+_DOTS = 200  # values of which each is in sight; of more, as of many frames, an axis leaves the smallest out
 _COLORS = 256
 _RAMP = 64  # colours kept of each colour scale: its bar shows no steps
 # Of text, and of floors and their shadows, whose soft edges would else become contours.
@@ -166,7 +167,8 @@ def error_scale(panel, values, along: str = "y") -> None:
     logarithmic = len(values) > 0 and np.max(values) > 30 * np.quantile(values, 0.05)
     if logarithmic:
         panel.set(**{f"{along}scale": "log"})
-        limits = (np.quantile(values, 0.02) / 1.6, np.max(values) * 1.6)
+        smallest = np.quantile(values, 0.02 if len(values) > _DOTS else 0.0)
+        limits = (smallest / 1.6, np.max(values) * 1.6)
     panel.set(**{f"{along}lim": limits})
     if logarithmic:
         plain_ticks(getattr(panel, f"{along}axis"))

@@ -84,7 +84,7 @@ def speedup_and_memory(view: View) -> Figures:
     colors = {"speedup_step": "#009E73", "speedup_total": "#CC79A7", "speedup_decoded": "#E69F00"}
     _numbers(speed, averages, colors)
     _numbers(memory, averages, {"memory_full_mib": FULL, "memory_mib": REDUCED})
-    speed.axvline(1, color=INK, lw=1)
+    speed.axvline(1, color=INK, lw=1, zorder=0.9)
     speed.set_xlabel("speedup over full order [×]")
     memory.set_xlabel("peak memory [MiB]")
     speed.set_yticks(np.arange(len(averages)), row_names(averages))
@@ -122,18 +122,25 @@ def step_over_particles(view: View) -> Figures:
     return {"step-over-particles": fig}
 
 
-@chart("Where the time of a step goes, stage by stage; measuring takes a little time too.")
+@chart(
+    "Where the time of a step goes. The step is timed in whole runs, as in the table; its stages in other "
+    "steps, with a wait for the device after each, so that their sum differs from the step."
+)
 def runtime(view: View) -> Figures:
     """Time of each stage of a step above that of the full-order step, a figure a body and model."""
     figures = {}
     for stem, series in best_series(view):
         stages = view.stages.get(f"{series['body'].iloc[0]} · {series['variant'].iloc[0]}", {})
         if len(stages) > 1:
-            steps = {
-                f"{series['model_name'].iloc[0]} step": stages,
-                "full-order step": view.stages["full order"],
+            row = view.frame[view.frame["run"] == series["run"].iloc[0]].iloc[0]
+            steps = (
+                (row["model_name"], row["step_ms"], stages),
+                ("full order", row["step_ms_full"], view.stages["full order"]),
+            )
+            titles = {
+                f"{name}: step {number(ms)} ms, stages {number(sum(of.values()))} ms": pd.Series(of)
+                for name, ms, of in steps
             }
-            titles = {f"{name}, {number(sum(of.values()))} ms": pd.Series(of) for name, of in steps.items()}
             figures[f"{stem}runtime"] = bars(titles)
     return figures
 
@@ -181,6 +188,7 @@ def _numbers(panel, averages: pd.DataFrame, columns: Mapping[str, str]) -> None:
         for x, y in zip(averages[name], at, strict=True):
             if math.isfinite(x):
                 place = {"textcoords": "offset points", "va": "center", "fontsize": 8.5}
+                place |= {"bbox": {"facecolor": "white", "linewidth": 0, "pad": 0.6}}  # over the line at 1×
                 panel.annotate(number(x), (x, y), (6, 0), **place)
     low, high = panel.get_xlim()
     panel.set_xlim(low, high * (high / low) ** 0.16)  # room for the last numbers

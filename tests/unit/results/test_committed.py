@@ -10,8 +10,7 @@ from PIL import Image
 
 from nsf.cli import main
 from nsf.errors import SchemaError
-from nsf.results import committed, pictures, table
-from nsf.results.charts import errors
+from nsf.results import committed, pictures, style, table
 from nsf.results.page import Picture, Section
 from nsf.results.question import Question
 from nsf.results.report import build_report
@@ -115,7 +114,7 @@ def test_a_row_that_was_changed_is_noticed_by_its_charts_and_page(folder):
 
 def test_a_chart_that_is_drawn_otherwise_is_noticed_and_drawn_again(folder, monkeypatch):
     before = (folder / "noise/weak/delta.png").read_bytes()
-    monkeypatch.setattr(errors, "REDUCED", "#00ff00")
+    monkeypatch.setattr(style, "PALETTE", ("#00ff00",))
     assert any("noise/weak/delta.png is not the chart" in fault for fault in faults(folder))
     committed.write_list(folder)
     assert faults(folder) == []
