@@ -1,8 +1,8 @@
 """The command line in a process of its own that need not import torch again.
 
-A server process imports once what the stages import when they work; each call is a fork of it. A fault
-names a fault that the child brings upon itself at an exact moment, so that no test depends on how fast it
-runs.
+Each call is a fork of this process, which has imported what the stages import when they work; where there is
+a GPU, whose libraries survive no fork, of a server process that has. A fault names a fault that the child
+brings upon itself at an exact moment, so that no test depends on how fast it runs.
 """
 
 import gc
@@ -13,17 +13,22 @@ import resource
 import shutil
 import signal
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
+import torch
 
 
 @cache
 def _context():
-    """Processes that are forks of one server; it finds `preloaded` and what that imports by their folders."""
+    """Forks of this process, or of a server, which finds `preloaded` by its folder."""
+    importlib.import_module("preloaded")
+    if not torch.cuda.is_available():
+        return multiprocessing.get_context("fork")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["preloaded", "forked"])
     folders = [str(Path(__file__).parent), str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]
@@ -134,24 +139,31 @@ def _child(arguments, environment, folder, faults):
     gc.freeze()  # as pytest_collection_finish does: an evaluation collects garbage six times
     for fault in faults:
         fault()
-    import torch
-
     from nsf.cli import main
 
     torch.set_num_threads(1)
     main(arguments)
 
 
-def run_nsf(arguments, root: Path, folder: Path, *faults, timeout=120) -> Outcome:
+def run_nsf(arguments, root: Path, folder: Path, *faults) -> Outcome:
     """`nsf *arguments` with NSF_RUNS = root, from within an empty folder."""
+    return begin_nsf(arguments, root, folder, *faults)()
+
+
+def begin_nsf(arguments, root: Path, folder: Path, *faults, timeout=120) -> Callable[[], Outcome]:
+    """The same under way, and what waits for its end."""
     folder.mkdir(parents=True, exist_ok=True)
     environment = {"NSF_RUNS": str(root), "NSF_REPORTS": str(folder / "reports"), "OMP_NUM_THREADS": "1"}
     process = _context().Process(target=_child, args=(list(arguments), environment, folder, faults))
     process.start()
-    process.join(timeout)
-    if process.exitcode is None:
-        process.kill()
-        process.join()
-        raise AssertionError(f"nsf {arguments} did not end in {timeout} s")
-    texts = [(folder / name).read_text() if (folder / name).exists() else "" for name in ("out", "err")]
-    return Outcome(process.exitcode, *texts)
+
+    def end() -> Outcome:
+        process.join(timeout)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+            raise AssertionError(f"nsf {arguments} did not end in {timeout} s")
+        texts = [(folder / name).read_text() if (folder / name).exists() else "" for name in ("out", "err")]
+        return Outcome(process.exitcode, *texts)
+
+    return end

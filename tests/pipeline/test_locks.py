@@ -1,10 +1,9 @@
 """Two processes on one data set: nothing is made twice, nothing is spoilt."""
 
 import re
-from concurrent.futures import ThreadPoolExecutor
 
 import pandas as pd
-from forked import PlainReport, run_nsf
+from forked import PlainReport, begin_nsf
 
 from nsf.data import Trajectory
 from nsf.runs import Run
@@ -13,11 +12,10 @@ from nsf.runs import Run
 def test_two_runs_at_once_share_the_work(tiny, tmp_path):
     root = tmp_path / "runs"
 
-    def run(name):
-        return run_nsf(["run", *tiny, f"report.name={name}"], root, tmp_path / name, PlainReport())
+    def begin(name):
+        return begin_nsf(["run", *tiny, f"report.name={name}"], root, tmp_path / name, PlainReport())
 
-    with ThreadPoolExecutor(2) as pool:
-        outcomes = list(pool.map(run, ("one", "two")))
+    outcomes = [end() for end in [begin("one"), begin("two")]]
     assert [outcome.code for outcome in outcomes] == [0, 0], [outcome.err for outcome in outcomes]
     said = "".join(outcome.out for outcome in outcomes)
     assert sum(map(int, re.findall(r"simulate: (\d+) trajectories in", said))) == 4
@@ -31,11 +29,10 @@ def test_two_runs_at_once_share_the_work(tiny, tmp_path):
         assert len(pd.read_csv(tmp_path / name / "reports" / name / "results.csv")) == 1
 
 
-def test_two_reports_at_once_leave_a_whole_one(nsf, copied, tmp_path):
+def test_two_reports_at_once_leave_a_whole_one(tiny, copied, tmp_path):
     root = copied("simulate", "train", "deploy", "evaluate")
-    with ThreadPoolExecutor(2) as pool:
-        outcomes = list(pool.map(lambda _: nsf("report", root, faults=[PlainReport()]), range(2)))
-    assert [outcome.code for outcome in outcomes] == [0, 0]
+    both = [begin_nsf(["report", *tiny], root, tmp_path / "work", PlainReport()) for _ in range(2)]
+    assert [end().code for end in both] == [0, 0]
     reports = tmp_path / "work/reports"
     assert [path.name for path in reports.iterdir() if not path.name.startswith(".")] == ["sand_small"]
     assert (reports / "sand_small/sources.json").is_file()

@@ -28,24 +28,6 @@ def line(name: str, text: str) -> str:
     return re.search(rf"^  {name} +(.*)$", text, re.MULTILINE)[1]
 
 
-def test_versions_and_devices(told):
-    text = told()
-    for name in ("nsf", "python", "warp", "torch", "lightning", "hydra", "numpy"):
-        assert re.match(r"\d+\.\d+", line(name, text)), name
-    assert "cores" in line("cpu", text)
-    assert re.search("no GPU|driver", text)
-    assert "warning" not in text
-
-
-def test_folders_with_their_sizes(told, tmp_path):
-    assert line("runs", told()) == f"{tmp_path / 'runs'} (not there), 0 runs"
-    run = tmp_path / "runs/train/sand/abc"
-    run.mkdir(parents=True)
-    (run / "manifest.json").write_text("{}")
-    (run / "manifold.pt").write_bytes(bytes(3 << 20))
-    assert line("runs", told()) == f"{tmp_path / 'runs'} (3.0 MiB), 1 runs"
-
-
 def test_extras_that_are_missing(told, monkeypatch):
     required = [
         "numpy>=2",

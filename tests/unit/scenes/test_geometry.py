@@ -15,7 +15,6 @@ SHAPES = [
     pytest.param(Box((0.1, 0.2, 0.3), (0.5, 0.4, 0.9)), id="box"),
     pytest.param(Cylinder((0.5, 0.5, 0.13), 0.2, 0.3), id="cylinder"),
     pytest.param(Cylinder((0.5, 0.5, 0.13), 0.02, 0.4), id="thin cylinder"),
-    pytest.param(Box((0.2, 0.2, 0.4), (0.8, 0.8, 0.5)), id="slab"),
     pytest.param(Ball((0.5, 0.4, 0.3), 0.2), id="ball"),
     pytest.param(Frame((0.2, 0.4, 0.3), (0.8, 0.6, 0.7), 0.1), id="frame"),
     pytest.param(Ribbon(ZIGZAG, 0.06), id="bent ribbon"),
@@ -159,7 +158,7 @@ def test_refused(build, quoted):
         build()
 
 
-def counted(shape, points=400_000):
+def counted(shape, points=200_000):
     """Volume [m³] by random points, and its standard error."""
     lower, upper = shape.bounds
     hits = shape.contains(np.random.default_rng(0).uniform(lower, upper, (points, 3))).mean()
@@ -204,7 +203,7 @@ class TestRibbon:
         tube = np.pi * 0.1**2 * 0.5 * 0.5 * np.pi + 4.0 / 3.0 * np.pi * 0.1**3
         assert Ribbon(path, 0.1).volume == pytest.approx(tube, rel=1e-5)
 
-    @pytest.mark.parametrize("seed", range(8))
+    @pytest.mark.parametrize("seed", range(4))
     def test_volume_of_any_path_that_is_accepted(self, seed):
         """Bends of all sizes, also tight ones: the closed form, or a refusal."""
         rng = np.random.default_rng(seed)

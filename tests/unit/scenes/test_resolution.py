@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from meshes import cube, sphere, torus, turned, write
+from meshes import cube, torus, turned, write
 
 from nsf import load_scene
 from nsf.scenes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, TentacleBall
@@ -41,7 +41,6 @@ KNOWN = {
     "rod": (Box((0.2, 0.2, 0.4), (0.8, 0.23, 0.44)), 0.03),
     "cylinder": (Cylinder((0.5, 0.5, 0.13), 0.1, 0.3), 0.2),
     "thin cylinder": (Cylinder((0.5, 0.5, 0.13), 0.02, 0.4), 0.04),
-    "disc": (Cylinder((0.5, 0.5, 0.13), 0.2, 0.03), 0.03),
     "ball": (Ball((0.5, 0.4, 0.3), 0.2), 0.4),
     "frame": (Frame((0.2, 0.4, 0.3), (0.8, 0.6, 0.7), 0.1), 0.1),
     "flat frame": (Frame((0.2, 0.4, 0.3), (0.8, 0.45, 0.7), 0.1), 0.05),
@@ -50,10 +49,8 @@ KNOWN = {
     "chair": (CHAIR, LEG),
 }
 MESHES = {
-    "box": (cube((0.0, 0.0, 0.0), (0.3, 0.1, 0.5)), 0.1),
     "rod": (cube((0.0, 0.0, 0.0), (0.05, 0.05, 0.5)), 0.05),
     "torus": (torus(0.3, 0.05), 0.1),
-    "sphere": (sphere(3), 2.0),
 }
 
 
