@@ -1,5 +1,7 @@
 """Models that are wrong on purpose are red or amber, and the bound of a good one holds."""
 
+import shutil
+
 import pandas as pd
 import pytest
 
@@ -7,18 +9,21 @@ from nsf.deployment import TRUST, Trust
 
 VALIDATED = ("scene.design.validation=[24,34]", "scene.design.test=[26,36]")
 UNTIMED = ("evaluation.trials=0", "evaluation.coarse=[]")
-STAGES = ("simulate", "train", "teach", "deploy", "evaluate")
+STAGES = ("simulate", "train", "teach", "deploy")
 QUICK = ("model=recurrence", "model.runs=4", "model.descents=2", "model.width=8", "model.members=2")
 
 
 @pytest.fixture(scope="module")
 def root(chain, tmp_path_factory):
-    return tmp_path_factory.mktemp("trust") / "runs"
+    root = tmp_path_factory.mktemp("trust") / "runs"
+    for stage in ("simulate", "train"):
+        shutil.copytree(chain.root / stage, root / stage)
+    return root
 
 
 @pytest.fixture
-def rows(pipeline_at, root):
-    """Overrides → the pipeline, its rows and what it said."""
+def deployed(pipeline_at, root):
+    """Overrides → the pipeline with its runs, and what it said."""
 
     def run(*overrides):
         said = []
@@ -26,7 +31,18 @@ def rows(pipeline_at, root):
         for stage in STAGES:
             if stage in pipeline.stages:
                 pipeline.run(stage)
-        return pipeline, pd.read_csv(pipeline.evaluation.file("results.csv")), said
+        return pipeline, said
+
+    return run
+
+
+@pytest.fixture
+def rows(deployed):
+    """Overrides → the pipeline, its rows and what it said."""
+
+    def run(*overrides):
+        pipeline, said = deployed(*overrides)
+        return pipeline, pd.read_csv(pipeline.evaluate().file("results.csv")), said
 
     return run
 
@@ -37,16 +53,15 @@ def test_a_good_model_is_green_and_its_bound_holds(rows, model):
     assert table["flag"].tolist() == ["green", "green"]
     assert (table["error_bound"] >= table["displacement_error"]).all()
     assert (table["error_bound"] <= 5.0 * table["displacement_error"]).all()
-    assert any(line.startswith("deploy: friction_angle=26°: green: error ") for line in said)
     assert sum("2 validation runs set the error bounds" in line for line in said) == 1
     assert pipeline.validating.deployment.id in pipeline.deployment.parents
     trust = Trust.open(pipeline.deployment.file(TRUST), pipeline.manifold())
     assert trust.calibration.errors.shape == (2,)
 
 
-def test_validation_runs_are_made_once(rows):
-    rows("model=interpolate")
-    _, _, said = rows("model=interpolate", "scene.design.test=[27]")
+def test_validation_runs_are_made_once(deployed):
+    deployed("model=interpolate")
+    _, said = deployed("model=interpolate", "scene.design.test=[27]")
     assert any("deploy: inputs unchanged, reused" in line for line in said)
 
 
@@ -62,9 +77,10 @@ def test_validation_runs_are_made_once(rows):
     ],
     ids=["baseline", "one coordinate", "two training runs", "another law", "gravity", "untrained"],
 )
-def test_what_is_wrong_on_purpose_is_red_or_amber(rows, wrong):
-    _, table, _ = rows(*wrong)
-    assert set(table["flag"]) <= {"red", "amber"}
+def test_what_is_wrong_on_purpose_is_red_or_amber(deployed, wrong):
+    pipeline, _ = deployed(*wrong)
+    flags = pipeline.deployment.manifest["metrics"]["flags"]
+    assert flags["red"] + flags["amber"] == sum(flags.values()) == 2
 
 
 def test_one_validation_run_gives_a_coarse_bound(rows):
@@ -80,10 +96,10 @@ def test_validation_cases_in_a_corner(rows):
     assert table["error_bound"][1] > table["error_bound"][0]
 
 
-def test_cases_are_drawn_from_the_whole_range(rows):
+def test_cases_are_drawn_from_the_whole_range(deployed):
     """Training cases do not reach its ends; a case that is drawn there is none beyond."""
     drawn = "scene.design={_target_:nsf.scenes.Sobol,train:4,validation:2,test:2}"
-    pipeline, _, _ = rows("+scene.parameters.friction_angle.range=[22,38]", drawn, "model=interpolate")
+    pipeline, _ = deployed("+scene.parameters.friction_angle.range=[22,38]", drawn, "model=interpolate")
     trust = Trust.open(pipeline.deployment.file(TRUST), pipeline.manifold())
     assert trust.reach.box.tolist() == [[22.0, 38.0]]
     assert pipeline.split.box.tolist() != [[22.0, 38.0]]
