@@ -90,6 +90,12 @@ class Pipeline(Configured):
             pipeline.choose(run.metric("model", kind=str))
         return pipeline
 
+    def _repr_html_(self) -> str:
+        """Its runs and, once it is evaluated, its errors and a strip, for a notebook."""
+        from nsf.results.notebook import html
+
+        return html([self.training, self.deployment, self.evaluation])
+
     def check(self) -> "Pipeline":
         """This pipeline, once everything that its stages need is built and checked.
 

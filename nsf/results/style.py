@@ -282,12 +282,12 @@ def save(fig: Figure, folder, stem: str, kinds=("svg", "png"), ramps=()) -> list
     return names
 
 
-def write_png(fig: Figure, path: Path, dpi: float, ramps: Sequence[str] = ()) -> None:
+def write_png(fig: Figure, path: Path | io.BytesIO, dpi: float, ramps: Sequence[str] = ()) -> None:
     """Write a figure without a date, in its own colours where these are few, else in those nearest to them.
 
     Args:
         fig: the figure; its background is white.
-        path: of the file.
+        path: of the file, or a buffer.
         dpi: pixels an inch.
         ramps: names of the colour scales in it, of matplotlib.
     """
