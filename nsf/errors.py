@@ -69,14 +69,11 @@ def first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def unknown(
-    key: str, keys: Iterable[str], remedy: str = "see `nsf --help` for the groups", taker: str = ""
-) -> str:
+def unknown(key: str, keys: Iterable[str], taker: str = "") -> str:
     """A message that names a dotted key that there is not, and the nearest one, or those next to it.
 
     Args:
         key: that nothing reads; keys: those that are read.
-        remedy: where no key is near.
         taker: the class that does not take the key.
     """
     head = f"unknown key {key!r}{f' of {taker}' if taker else ''}"
@@ -89,7 +86,7 @@ def unknown(
     if not near and parent and beside:
         return f"{head}; {parent} has {', '.join(beside)}"
     near = near or difflib.get_close_matches(key, keys, n=1)
-    return f"{head}; {f'did you mean {near[0]}?' if near else remedy}"
+    return f"{head}; {f'did you mean {near[0]}?' if near else 'see `nsf --help` for the groups'}"
 
 
 # How libraries say that memory ran out, or that a limit on it, as `ulimit -v`, was met.

@@ -63,15 +63,15 @@ def check(value: Any, schema: Any, name: str = "it") -> None:
         for place, item in enumerate(value):
             check(item, kind[0], f"{name}[{place}]")
     if isinstance(kind, Mapping):
-        rest = dict(value)
+        rest, head = dict(value), "" if name == "it" else f"{name}."
         for key, inner in kind.items():
-            own = key.key if isinstance(key, Maybe) else key
-            if own in rest:
-                check(rest.pop(own), inner, own if name == "it" else f"{name}.{own}")
+            text = key.key if isinstance(key, Maybe) else key
+            if text in rest:
+                check(rest.pop(text), inner, f"{head}{text}")
             elif key is not ... and not isinstance(key, Maybe):
-                raise SchemaError(f"{name} lacks {own}")
+                raise SchemaError(f"{name} lacks {text}")
         for key, item in rest.items() if ... in kind else ():
-            check(item, kind[...], f"{name}.{key}")
+            check(item, kind[...], f"{head}{key}")
 
 
 def parse(text: str, name: str, schema: Any) -> Any:

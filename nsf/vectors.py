@@ -14,6 +14,14 @@ def spaced(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
+def drawn(count: int, most: int) -> np.ndarray:
+    """At most `most` of the indices 0 … count − 1, drawn alike at each call, ascending.
+
+    Strides of a quasi-random sequence, as particles have, would show a pattern.
+    """
+    return np.sort(np.random.default_rng(0).permutation(count)[:most])
+
+
 def is_list(values) -> bool:
     """Whether values are several, of a yaml or of Python."""
     return isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)

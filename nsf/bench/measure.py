@@ -18,6 +18,7 @@ from nsf.timing import MemoryProbe, elapsed_ms, synchronizer
 WINDOW = 100  # steps of a trial at most, so that the clock and the last synchronisation are lost in it
 WARM_UP = 3  # steps that compile, load and capture
 _COPY_BYTES = {"cuda": 2**30, "cpu": 2**27}  # larger than any cache
+_TRIALS = 5  # of passes
 _REPEATS = 10  # of a pass in one graph, so that launching it costs nothing
 
 
@@ -124,7 +125,7 @@ def turns(
     return {name: np.array(times) for name, times in taken.items()}
 
 
-def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
+def pass_time(call: Callable[[], None], device: str) -> float:
     """Median time of one call of kernels [ms]; on a GPU from a graph of many."""
     wait = synchronizer(device)
 
@@ -141,7 +142,7 @@ def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
             wp.capture_launch(capture.graph)
 
         many()
-    return float(np.median([elapsed_ms(many, wait) for _ in range(trials)])) / _REPEATS
+    return float(np.median([elapsed_ms(many, wait) for _ in range(_TRIALS)])) / _REPEATS
 
 
 def launch_time(device: str, count: int) -> float:

@@ -18,40 +18,29 @@ ROLES = ("#BBBBBB", "#0072B2", "#D55E00")
 
 
 class ColorScale:
-    """A colour scale from zero, or about it, in the unit that suits its end.
+    """A colour scale from zero, in the unit that suits its end.
 
     Args:
         top: where it ends, in SI.
         cmap: of matplotlib.
         factor, unit: of what is written beside it.
-        signed: it begins at −top instead of 0.
         title: of the quantity.
         power: of the share of `top` that a colour stands for; below 1 it parts small values.
     """
 
     def __init__(
-        self,
-        top: float,
-        cmap: str,
-        factor: float,
-        unit: str,
-        signed: bool = False,
-        title: str = "",
-        power: float = 1.0,
+        self, top: float, cmap: str, factor: float, unit: str, title: str = "", power: float = 1.0
     ):
         self.factor, self.unit, self.top, self.title = factor, unit, top, title
-        bottom = -top / factor if signed else 0.0
-        scale = Normalize(bottom, top / factor) if power == 1.0 else PowerNorm(power, bottom, top / factor)
+        scale = Normalize(0.0, top / factor) if power == 1.0 else PowerNorm(power, 0.0, top / factor)
         self.mappable = ScalarMappable(scale, matplotlib.colormaps[cmap])
 
     @classmethod
-    def up_to(
-        cls, top: float, cmap: str, units, signed: bool = False, title: str = "", power: float = 1.0
-    ) -> "ColorScale":
+    def up_to(cls, top: float, cmap: str, units, title: str = "", power: float = 1.0) -> "ColorScale":
         """`top` in SI; the largest unit in which it is no less than 0.3 is taken."""
         top = float(top) if np.isfinite(top) and top > 0 else units[-1][0]
         factor, unit = next(((f, u) for f, u in units if top >= 0.3 * f), units[-1])
-        return cls(top, cmap, factor, unit, signed, title, power)
+        return cls(top, cmap, factor, unit, title, power)
 
     @property
     def label(self) -> str:

@@ -12,7 +12,7 @@ from nsf.bodies.camera import Camera, View
 from nsf.bodies.colors import Categories, ColorScale
 from nsf.bodies.sheet import Sheet
 from nsf.bodies.solids import Solids
-from nsf.vectors import spaced
+from nsf.vectors import drawn, spaced
 
 WIDE = 420  # [pixel] of a picture in a strip
 _THIN = 0.5  # of the larger horizontal extent: below it a body, as a slice or a frame, counts as thin
@@ -203,6 +203,6 @@ def _laid_over(picture: np.ndarray, over: np.ndarray, opacity: float) -> np.ndar
 
 def _radius(X: np.ndarray) -> float:
     """A ball's radius [m] at which points X [n, 3] look closed: from how near their neighbours are."""
-    some = np.random.default_rng(0).permutation(len(X))[:_NEIGHBOURS]
+    some = drawn(len(X), _NEIGHBOURS)
     reach = cKDTree(X).query(X[some], min(9, len(X)))[0][:, -1]
     return max(_CLOSED * float(np.median(reach)), 1e-9)

@@ -25,8 +25,8 @@ from nsf.vectors import spaced
 
 #: File of a deploy run with what bounds the errors of its model.
 TRUST = "trust.json"
-#: Particles at which displacements are taken, and training states that tell of them or of distances.
-_PARTICLES, _ROWS, _NEAREST = 500, 256, 4096
+#: Training states that tell of displacements, or of distances.
+_ROWS, _NEAREST = 256, 4096
 #: Growth of a bound a side of the box of parameters away from the nearest validation case.
 _AWAY = 0.5
 
@@ -113,12 +113,10 @@ def metric_of(manifold) -> np.ndarray:
 
     From a linear fit of positions at training states, so that no distance needs a field.
     """
-    particles = np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_PARTICLES])
-    device, latents = manifold.X.device, manifold.training_latents
-    at = manifold.restrict(torch.as_tensor(particles), device=device)
+    (particles, at), latents = manifold.at_some(), manifold.training_latents
     rows = latents[torch.as_tensor(spaced(len(latents), _ROWS), device=latents.device)]
     with torch.no_grad():
-        x = at.position(rows.to(device, at.dtype)).double().cpu().numpy().reshape(len(rows), -1)
+        x = at.position(rows.to(at.device, at.dtype)).double().cpu().numpy().reshape(len(rows), -1)
     xhat = rows.double().cpu().numpy()
     moves = np.linalg.lstsq(xhat - xhat.mean(0), x - x.mean(0), rcond=None)[0]
     values, axes = np.linalg.eigh(moves @ moves.T / len(particles))

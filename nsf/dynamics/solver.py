@@ -338,20 +338,18 @@ class ReducedMPM:
                 first += len(x)
         return -1
 
-    def needed_outside(self, steps: int | None = None) -> int:
+    def needed_outside(self) -> int:
         """Most particles and nodes that a step needed and the superset lacks, or that were off the grid.
 
         The transfers pass over what is off the grid, and over nodes that are not stored, so both count. Call
-        it after a run: it decodes every particle at each of the first `steps` steps, all of them by default.
+        it after a run: it decodes every particle at each step.
 
         Source: paper section 5.4, b.
         """
         if self.sets[0].nodes is None or self.span.latent_only:
             return 0
         search, worst, n = self.setup.search, 0, 0
-        for block in self.decoder().positions(
-            self.record.xhat[: self.steps_taken if steps is None else steps]
-        ):
+        for block in self.decoder().positions(self.record.xhat[: self.steps_taken]):
             for x in block:
                 worst = max(worst, search.missing(x, self.sets_at(n)))
                 n += 1

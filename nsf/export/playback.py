@@ -29,6 +29,7 @@ from nsf.pipeline import Pipeline
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.scenes import Scene
+from nsf.vectors import drawn
 
 BLOCK = 1 << 21  # positions of all frames that are decoded at once: with τ some hundred MiB
 SHOWN = 2000  # particles that set the colour scale and the camera
@@ -185,8 +186,7 @@ class Playback:
             X = constants.X
             rows = torch.cat(lying_together(torch.as_tensor(X), POINTS)).numpy()
         elif points is not None:
-            # At random, as for reports: strides of a quasi-random sequence would show a pattern.
-            rows = np.sort(np.random.default_rng(0).permutation(len(X))[:points])
+            rows = drawn(len(X), points)
         self.X, self._rows = X[rows], rows
         self._moduli = None
         if not self._pipeline.sources.neural_stress:

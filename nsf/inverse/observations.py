@@ -18,6 +18,7 @@ from nsf.inverse.columns import COLUMNS, read_columns
 from nsf.inverse.model import Model
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Restriction
+from nsf.vectors import drawn
 from nsf.words import NUMBER
 
 _Positions = Callable[[np.ndarray], Tensor]
@@ -79,10 +80,11 @@ class Observations:
         )
 
     @classmethod
-    def of_scalars(
-        cls, values: Mapping[str, float], times: float | np.ndarray, deviation: float = 1e-3
-    ) -> "Observations":
-        """Quantities and components of points, as `z@X:Y:Z`, by name [m], at each of some times [s]."""
+    def of_scalars(cls, values: Mapping[str, float], times: float | np.ndarray) -> "Observations":
+        """Quantities and components of points, as `z@X:Y:Z`, by name [m], at each of some times [s].
+
+        Their deviation is 1 mm.
+        """
         times = np.atleast_1d(times)
         what, points = zip(*(component(name) or (name, np.full(3, np.nan)) for name in values), strict=True)
         return cls(
@@ -90,7 +92,7 @@ class Observations:
             what * len(times),
             np.tile(points, (len(times), 1)),
             np.tile(np.array(list(values.values()), float), len(times)),
-            np.full(len(times) * len(values), deviation),
+            np.full(len(times) * len(values), 1e-3),
         )
 
     @classmethod
@@ -192,7 +194,7 @@ class View:
         self._frames = np.round(t[self._of_shape] / model.dt).astype(int)
         self._looks = np.arange(len(model.t)) if looks is None else looks
         self._order = np.argsort([*self._of_points, *self._of_shape])
-        self._body = np.sort(np.random.default_rng(0).permutation(len(X))[:BODY])
+        self._body = drawn(len(X), BODY)
         self._X = X[torch.as_tensor(self._body)].to(model.device)
 
     def of_runs(self, xhat: Tensor) -> Tensor:

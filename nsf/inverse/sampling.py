@@ -176,15 +176,15 @@ class Runs:
         """[B] whether a run is to be believed."""
         return ~(self.error_bound > self.limit) & np.isfinite(self.values).all((1, 2))
 
-    def quantiles(self, levels: Sequence[float] = LEVELS) -> dict[str, np.ndarray]:
-        """[levels, F] of trusted runs, by name.
+    def quantiles(self) -> dict[str, np.ndarray]:
+        """[`LEVELS`, F] of trusted runs, by name.
 
         Raises:
             InstabilityError: no run is to be believed.
         """
         if not self.trusted.any():
             raise InstabilityError("no run is to be believed; draw parameters within what was taught")
-        quantiles = np.quantile(self.values[self.trusted], levels, axis=0)
+        quantiles = np.quantile(self.values[self.trusted], LEVELS, axis=0)
         return {name: quantiles[:, k] for k, name in enumerate(self.names)}
 
 

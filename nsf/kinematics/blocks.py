@@ -5,6 +5,7 @@ from torch import Tensor
 
 _HOST_BYTES = 2**25  # of a block on the CPU: about its last cache
 _SHARE = 0.25  # of the free memory of a GPU
+_ROWS = 3 * 500  # of modes at most, of which the error of tf32 is taken
 _SLICES = 128  # of a product, which a GPU works on side by side
 #: Modes of a tile of the product on the CPU [values]: about the second level of its cache.
 TILE = 2**18
@@ -20,14 +21,13 @@ def frames_at_once(values: int, dtype: torch.dtype, device: torch.device | str) 
     return max(1, room // max(1, values * dtype.itemsize))
 
 
-def tf32_error(coefficients: Tensor, modes: Tensor, rows: int = 3 * 500) -> float:
+def tf32_error(coefficients: Tensor, modes: Tensor) -> float:
     """Error of a product whose factors are rounded to tf32, over its size; at some evenly spread rows.
 
     Args:
         coefficients: [F, K] float32; modes: [n, K] float32.
-        rows: of the modes, at most.
     """
-    some = modes[:: max(1, len(modes) // rows)]
+    some = modes[:: max(1, len(modes) // _ROWS)]
     exact = coefficients.double() @ some.double().T
     off = _as_tf32(coefficients).double() @ _as_tf32(some).double().T - exact
     return float(off.norm() / exact.norm().clamp_min(1e-300))

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -19,6 +20,9 @@ from nsf.kinematics import checkpoint
 from nsf.kinematics.blocks import frames_at_once
 from nsf.schemas import Number
 from nsf.storage import writing
+from nsf.vectors import drawn
+
+_SOME = 500  # particles that stand for the body
 
 
 class Restriction(ABC):
@@ -202,6 +206,11 @@ class Manifold(nn.Module, ABC):
         device: torch.device | str = "cpu",
     ) -> Restriction:
         """The fields at training particles (indices [n]; all if neither is given) or at points X [n, 3] m."""
+
+    def at_some(self) -> tuple[np.ndarray, Restriction]:
+        """Indices of 500 particles, alike at each call, and the fields at them, which stand for the body."""
+        particles = drawn(len(self.X), _SOME)
+        return particles, self.restrict(torch.as_tensor(particles), device=self.X.device)
 
     def check_particles(self, x_sha256: str) -> None:
         """Refuse particles other than those of training.

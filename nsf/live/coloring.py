@@ -11,9 +11,9 @@ from nsf.bodies.colors import (
     SIGNED_COLORS,
     STRESS_COLORS,
     Categories,
-    ColorScale,
 )
 from nsf.evaluation.metrics import pressure, von_mises
+from nsf.live import page
 from nsf.live.model import LiveModel, Truth
 from nsf.live.player import Moment
 
@@ -92,11 +92,8 @@ class Coloring:
 
 
 def _scale(title: str, unit: str, top: float, cmap: str, signed: bool = False) -> dict:
-    colors = ColorScale(1.0, cmap, 1.0, "").pixels(np.linspace(0, 1, 256))
-    return {
-        "title": title, "unit": unit, "low": -top if signed else 0.0, "top": top,
-        "colors": colors.ravel().tolist(),
-    }  # fmt: skip
+    low = -top if signed else 0.0
+    return {"title": title, "unit": unit, "low": low, "top": top, "colors": page.colors(cmap)}
 
 
 def _thirds() -> list[int]:

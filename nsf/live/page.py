@@ -54,11 +54,10 @@ def packed(header: Mapping, arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 @cache
-def script(entry: str = ENTRY) -> str:
+def script() -> str:
     """The modules that the page needs as one, each once and after those that it imports.
 
-    Args:
-        entry: the module that it begins with, without its ending. No two modules have a name in common.
+    No two modules have a name in common.
     """
     texts: dict[str, str] = {}
 
@@ -72,7 +71,7 @@ def script(entry: str = ENTRY) -> str:
         del texts[module]
         texts[module] = re.sub(r"^export ", "", _IMPORT.sub("", text), flags=re.MULTILINE)
 
-    add(entry)
+    add(ENTRY)
     return "\n" + "\n".join(texts.values())
 
 
@@ -109,9 +108,9 @@ def saved(path: Path, text: str) -> Path:
     return path
 
 
-def colors() -> list[int]:
-    """[256 × 3] the colours of a scale, of 8 bits."""
-    return ColorScale(1.0, STRESS_COLORS, 1.0, "").pixels(np.linspace(0, 1, 256)).ravel().tolist()
+def colors(cmap: str = STRESS_COLORS) -> list[int]:
+    """[256 × 3] the colours of a scale, of 8 bits; `cmap` is of matplotlib."""
+    return ColorScale(1.0, cmap, 1.0, "").pixels(np.linspace(0, 1, 256)).ravel().tolist()
 
 
 def solid(name: str, collider: "Collider") -> dict:

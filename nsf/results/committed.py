@@ -1,10 +1,10 @@
 """A folder of reports as one: one table of all their rows, one page, one picture a chart.
 
-`reports/results.csv` is the table, with the name of the report in each row; `provenance.json` has the
-question of each report, the origin of each run, the sha256 of each picture that runs alone can make, and of
-each chart one of its file and of all that it draws. `index.md` and the charts are made of these two, in the
-order of `contents.yaml`. Reports of inverse problems and benchmarks, whose rows are no cases, keep files of
-their own and are listed.
+`reports/results.csv` is the table, with the name of the report in each row; `provenance.json` has the record
+of each report (`nsf.results.folder`), with the sha256 of each picture that runs alone can make, and of each
+chart one of its file and of all that it draws. `index.md` and the charts are made of these two, in the order
+of `contents.yaml`. Reports of inverse problems and benchmarks, whose rows are no cases, have files of their
+own and are listed.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ from nsf.results import report, table
 from nsf.results.charts import CHARTS, View
 from nsf.results.charts.cases import COLORS
 from nsf.results.columns import COLUMNS
-from nsf.results.folder import MARK
+from nsf.results.folder import ANY, COMMITTED, MARK, PROVENANCE, RECORD
 from nsf.results.formats import Rows, markdown_document
 from nsf.results.page import Picture, Section
 from nsf.results.question import Question
@@ -36,8 +36,7 @@ from nsf.runs.provenance import not_ignored
 from nsf.schemas import Maybe
 from nsf.storage import write_json, writing
 
-TABLE, PROVENANCE, LIST, CONTENTS = "results.csv", "provenance.json", "index.md", "contents.yaml"
-_PARTS = ("reports", "runs", "pictures", "charts")  # of the provenance
+TABLE, LIST, CONTENTS = "results.csv", "index.md", "contents.yaml"
 _COLUMNS = (
     *("body", "variant", "case", "paper_delta", "delta", "displacement_error", "displacement_interpolated"),
     *("speedup_decoded", "stress_error"),
@@ -48,47 +47,33 @@ _MADE_ANEW = (".gif", ".html", ".mp4", ".svg", ".tex")  # of a report, and not c
 _REBUILD = "build it again with `nsf report`"
 
 
-_PROVENANCE = {key: {...: dict} for key in ("reports", "runs", "pictures")} | {Maybe("charts"): {...: str}}
 _CONTENTS = {
     Maybe("note"): str,
     Maybe("chapters"): {...: [str]},
     Maybe("paper"): {...: {"shows": str, "here": [str]}},
 }
-_MARK = {
-    Maybe("title"): str,
-    Maybe("files"): {...: str},
+#: Of the record of a report that has files of its own.
+_LISTED = ANY | {
     Maybe("chart"): ({"file": str}, None),
-    Maybe("listed"): {"headings": [str], "body": [[str]], "numeric": [bool], "made": str},
-}
-#: Of a report that `nsf report` wrote.
-_WRITTEN = {
-    "name": str,
-    "files": {...: str},
-    "runs": {...: dict},
-    "pictures": {...: {"caption": str, "runs": [str]}},
+    "listed": {"headings": [str], "body": [[str]], "numeric": [bool], "made": str},
 }
 
 
 @dataclass(frozen=True)
 class Reports:
-    """A folder of reports: its table, texts, origins and pictures.
+    """A folder of reports: its table, and the record of each.
 
     Attributes:
         folder: the folder.
         frame: the table.
-        texts: by report, what it says beside the table.
-        runs: by run id, its origin.
-        pictures: by path, caption, runs and sha256 of what was drawn from runs.
-        charts: by path, `_seal` of what was drawn from the table.
-        questions: by report, title, question and paper of its experiment, which say more than `texts`.
+        records: by report, its record: `files` are pictures drawn from runs, and `charts` has by file the
+            `_seal` of a chart of the table.
+        questions: by report, title, question and paper of its experiment, which say more than the records.
     """
 
     folder: Path
     frame: pd.DataFrame
-    texts: Mapping[str, Mapping]
-    runs: Mapping[str, Mapping]
-    pictures: Mapping[str, Mapping]
-    charts: Mapping[str, str]
+    records: Mapping[str, Mapping]
     questions: Mapping[str, Mapping] = field(default_factory=dict)
 
     @classmethod
@@ -99,47 +84,38 @@ class Reports:
             SchemaError: the table is none, or `provenance.json` lacks a key.
         """
         path = folder / PROVENANCE
-        content = _read(path, _PROVENANCE) if path.is_file() else {}
+        records = _read(path, {...: COMMITTED}) if path.is_file() else {}
         frame = table.read(folder / TABLE) if (folder / TABLE).is_file() else pd.DataFrame(columns=[*COLUMNS])
-        return cls(folder, frame, *(content.get(key, {}) for key in _PARTS), questions or {})
+        if lost := set(frame["report"]) - records.keys():
+            raise SchemaError(
+                f"{path} has no record of {min(lost)}; take it from git, or its rows out of {TABLE}"
+            )
+        return cls(folder, frame, records, questions or {})
 
     def collected(self) -> "Reports":
-        """With every report that `nsf report` wrote in the folder, each in the place of its older rows."""
-        whole = self
-        for mark in sorted(self.folder.rglob(MARK)):
-            content = _read(mark, _MARK)
-            if "made_of" in content and not_ignored([mark.with_name("delta.png")]):
-                whole = whole._with(mark.parent, _read(mark, _WRITTEN))
-        return whole
-
-    def _with(self, place: Path, content: Mapping) -> "Reports":
-        rows, name = table.read(place / TABLE), str(content["name"])
-        others = self.frame[self.frame["report"] != name]
-        frame = pd.concat([others, rows], ignore_index=True) if len(others) else rows
-        prefix = place.relative_to(self.folder).as_posix()
-        drawn = {
-            f"{prefix}/{file}": {**picture, "sha256": content["files"].get(file, "")}
-            for file, picture in content["pictures"].items()
-            if picture["caption"] not in {chart.caption for chart in CHARTS.values()}
-        }
-        older = {path: one for path, one in self.pictures.items() if not path.startswith(f"{prefix}/")}
-        keys = ("title", "question", "paper", "missing", "plots", "trained", "logarithmic")
-        texts = dict(self.texts) | {name: {key: content.get(key) for key in keys}}
-        return replace(
-            self, frame=frame, texts=texts, runs={**self.runs, **content["runs"]}, pictures=older | drawn
-        )
+        """With every report that `nsf report` wrote below the folder, each in the place of its older rows."""
+        frame, records = self.frame, dict(self.records)
+        for mark in sorted(self.folder.rglob(f"*/{MARK}")):
+            if "listed" in _read(mark, ANY) or not not_ignored([mark.with_name("delta.png")]):
+                continue
+            name = mark.parent.relative_to(self.folder).as_posix()
+            rows = table.read(mark.with_name(TABLE)).assign(report=name)
+            others = frame[frame["report"] != name]
+            frame = pd.concat([others, rows], ignore_index=True) if len(others) else rows
+            charts = records.get(name, {}).get("charts", {})
+            records[name] = _of_pictures(_read(mark, RECORD)) | {"charts": charts}
+        return replace(self, frame=frame, records=records)
 
     def save(self) -> None:
-        """Write the table and what stands beside it, without runs that no row or picture is of."""
-        runs = {*self.frame["run"], *(run for one in self.pictures.values() for run in one["runs"])}
+        """Write the table and the records of the reports in it, without runs that no row or picture is of."""
         table.write(self.frame, self.folder / TABLE)
-        content = {
-            "reports": {name: self.texts[name] for name in sorted(self.texts)},
-            "runs": {run: self.runs[run] for run in sorted(self.runs) if run in runs},
-            "pictures": {path: self.pictures[path] for path in sorted(self.pictures)},
-            "charts": dict(self.charts),
-        }
-        write_json(self.folder / PROVENANCE, content)
+        records = {}
+        for name, rows in self.frame.groupby("report"):
+            record = self.records[name]
+            shown = {*rows["run"], *(run for one in record["pictures"].values() for run in one["runs"])}
+            runs = {run: origin for run, origin in sorted(record["runs"].items()) if run in shown}
+            records[name] = {**record, "runs": runs}
+        write_json(self.folder / PROVENANCE, records)
 
     @cached_property
     def contents(self) -> dict[str, Any]:
@@ -171,16 +147,16 @@ class Reports:
 
     def question(self, name: str) -> Question:
         """The question of a report."""
-        texts = {**self.texts.get(name, {}), **self.questions.get(name, {})}
+        texts = {**self.records[name], **self.questions.get(name, {})}
         return Question(
-            name, texts.get("title") or name, texts.get("question") or "", texts.get("paper") or "",
-            missing=texts.get("missing") or (), plots=texts.get("plots"),
+            name, texts["title"], texts["question"], texts["paper"],
+            missing=texts["missing"], plots=texts["plots"],
         )  # fmt: skip
 
     def figures(self, name: str) -> Iterator[tuple[str, Figure]]:
-        """File stem and figure of each chart of a report."""
+        """File and figure of each chart of a report."""
         for stem, _, figure in report.figures(self.views[name], self.question(name).plots):
-            yield stem, figure
+            yield f"{stem}.png", figure
 
     @cached_property
     def views(self) -> dict[str, View]:
@@ -188,17 +164,21 @@ class Reports:
         return {name: self._view(name) for name in self.names}
 
     def _view(self, name: str) -> View:
-        texts = self.texts.get(name, {})
-        logarithmic = frozenset(texts.get("logarithmic") or ())
-        return View(table.labelled(self.rows(name)), None, {}, texts.get("trained") or {}, logarithmic)
+        record = self.records[name]
+        return View(
+            table.labelled(self.rows(name)), None, {}, record["trained"], frozenset(record["logarithmic"])
+        )
+
+    @property
+    def seals(self) -> dict[str, str]:
+        """The seal of each chart, by its path."""
+        of = self.records.items()
+        return {f"{name}/{file}": seal for name, record in of for file, seal in record["charts"].items()}
 
     def drawn(self, name: str) -> list[Picture]:
         """Pictures of a report that were drawn from runs."""
-        drawn = {path: one for path, one in self.pictures.items() if path.rpartition("/")[0] == name}
-        return [
-            Picture([path.rpartition("/")[2]], str(one["caption"]), list(one["runs"]))
-            for path, one in drawn.items()
-        ]
+        drawn = self.records[name]["pictures"].items()
+        return [Picture([file], one["caption"], one["runs"]) for file, one in drawn]
 
 
 def write_list(folder: Path, pages: bool = False, questions: Mapping[str, Mapping] | None = None) -> Path:
@@ -222,7 +202,8 @@ def write_list(folder: Path, pages: bool = False, questions: Mapping[str, Mappin
         reports = Reports.of(folder, questions)  # as another process would read it
         for name in reports.names if pages else ():
             _write_pages(reports, name)
-        reports = replace(reports, charts=_drawn(reports))
+        records = {name: {**reports.records[name], "charts": _drawn(reports, name)} for name in reports.names}
+        reports = replace(reports, records=records)
         reports.save()
     with writing(folder / LIST) as partial:
         partial.write_text(_page(reports), encoding="utf-8")
@@ -241,22 +222,21 @@ def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list
         SchemaError: the table is none, or a key is missing.
     """
     reports = Reports.of(folder, questions)
-    differing = [fault for mark in _listed(folder) for fault in _changed(mark.parent)]
-    for path, one in reports.pictures.items():
-        if not (folder / path).is_file():
-            differing.append(f"{folder / path} is missing; {_REBUILD}")
-        elif digest(folder / path) != one["sha256"]:
-            differing.append(f"{folder / path} was changed; {_REBUILD}")
-    if missing := set(reports.frame["run"]) - set(reports.runs):
-        differing.append(f"{folder / PROVENANCE} has no origin of {sorted(missing)[0]}; {_REBUILD}")
     again = f"write it with `nsf reports folder={folder}`"
+    differing = [fault for mark in _listed(folder) for fault in _changed(mark.parent)]
+    for name, record in reports.records.items():
+        differing += _altered(folder / name, record["files"])
+    for name in reports.names:
+        if missing := set(reports.rows(name)["run"]) - reports.records[name]["runs"].keys():
+            differing.append(f"{folder / PROVENANCE} has no origin of {sorted(missing)[0]}; {_REBUILD}")
     drawn = {
-        f"{name}/{stem}.png": fingerprint(figure)
+        f"{name}/{file}": fingerprint(figure)
         for name in reports.names
-        for stem, figure in reports.figures(name)
+        for file, figure in reports.figures(name)
     }
-    for path in sorted(drawn.keys() | reports.charts.keys()):
-        if path not in drawn or reports.charts.get(path) != _seal(drawn[path], folder / path):
+    seals = reports.seals
+    for path in sorted(drawn.keys() | seals.keys()):
+        if path not in drawn or seals.get(path) != _seal(drawn[path], folder / path):
             differing.append(f"{folder / path} is not the chart of {folder / TABLE}; {again}")
     page = folder / LIST
     if not page.is_file() or page.read_text(encoding="utf-8") != _page(reports):
@@ -264,17 +244,26 @@ def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list
     return differing
 
 
-def _drawn(reports: Reports) -> dict[str, str]:
-    """Draw the charts that are not there as the table has them; gives the seals of all, by path."""
-    seals = {}
-    for name in reports.names:
-        for stem, figure in reports.figures(name):
-            path, data = f"{name}/{stem}.png", fingerprint(figure)
-            file = reports.folder / path
-            if reports.charts.get(path) != _seal(data, file):
-                file.parent.mkdir(parents=True, exist_ok=True)
-                save(figure, file.parent, stem, ("png",), [COLORS])
-            seals[path] = _seal(data, file)
+def _of_pictures(record: Mapping) -> dict:
+    """The record of a report as it is committed: of its files those that were drawn from runs."""
+    charts = {chart.caption for chart in CHARTS.values()}
+    pictures = {file: one for file, one in record["pictures"].items() if one["caption"] not in charts}
+    committed = {key: record[key] for key in RECORD if key in record}
+    return committed | {
+        "pictures": pictures,
+        "files": {file: record["files"].get(file, "") for file in pictures},
+    }
+
+
+def _drawn(reports: Reports, name: str) -> dict[str, str]:
+    """Draw the charts of a report that are not there as the table has them; gives all seals, by file."""
+    seals, folder, recorded = {}, reports.folder / name, reports.records[name]["charts"]
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, figure in reports.figures(name):
+        data = fingerprint(figure)
+        if recorded.get(file) != _seal(data, folder / file):
+            save(figure, folder, Path(file).stem, ("png",), [COLORS])
+        seals[file] = _seal(data, folder / file)
     return seals
 
 
@@ -287,7 +276,8 @@ def _write_pages(reports: Reports, name: str) -> None:
     """The charts of a report as SVG, and its pages."""
     place, question, view = reports.folder / name, reports.question(name), reports.views[name]
     place.mkdir(parents=True, exist_ok=True)
-    runs = {run: reports.runs[run] for run in sorted(set(view.frame["run"])) if run in reports.runs}
+    of = reports.records[name]["runs"]
+    runs = {run: of[run] for run in sorted(set(view.frame["run"])) if run in of}
     charts = report.draw(view, place, question.plots)
     sections = [Section("Charts", charts), Section("Pictures", reports.drawn(name))]
     report.write_pages(question, place, sections, runs, view)
@@ -300,7 +290,8 @@ def _page(reports: Reports) -> str:
         chapters[reports.place(name)[1]].append(_section(reports, name))
     for entry in (*map(_listed_section, _listed(reports.folder)), *map(_bench, _benches(reports.folder))):
         chapters[list(chapters)[-1]].append(entry)
-    pictures = reports.pictures.keys() | reports.charts.keys()
+    pictures = {f"{name}/{one.files[-1]}" for name in reports.names for one in reports.drawn(name)}
+    pictures |= reports.seals.keys()
     figures = [
         (figure, entry["shows"], [path for path in entry["here"] if path in pictures])
         for figure, entry in reports.contents["paper"].items()
@@ -325,7 +316,7 @@ def _section(reports: Reports, name: str) -> dict:
         said.append(f"Model: {averages['model_name'].iloc[0]}.")
     varying = [c for c in _COLUMNS if c != "variant" or averages[c].nunique() > 1]
     names = [c for c in varying if c in averages and not averages[c].isna().all()][:_WIDE]
-    files = [Path(path).name for path in reports.charts if path.rpartition("/")[0] == name]
+    files = list(reports.records[name]["charts"])
     first = next((file for file in files if file.startswith("delta-over")), files[0] if files else "")
     return {
         "name": name,
@@ -340,8 +331,8 @@ def _section(reports: Reports, name: str) -> dict:
 
 def _made(reports: Reports, name: str) -> str:
     """How many runs, on what, at which scale and commit."""
-    rows = reports.rows(name)
-    runs = [reports.runs.get(run, {}) for run in rows["run"].unique()]
+    rows, origins = reports.rows(name), reports.records[name]["runs"]
+    runs = [origins.get(run, {}) for run in rows["run"].unique()]
     scales = " and ".join(sorted({str(run["scale"]) for run in runs if run.get("scale")}))
     commits = ", ".join(sorted({report.commit_text(run) for run in runs}))
     devices = sorted({re.sub(r"^NVIDIA | \d+GB.*", "", device) for device in rows["device"]})
@@ -358,13 +349,13 @@ def _read(path: Path, schema: Mapping) -> dict:
 def _listed(folder: Path) -> Iterator[Path]:
     """Marks of reports that have files of their own, as of inverse problems."""
     for mark in not_ignored(sorted(folder.rglob(MARK))):
-        if "listed" in _read(mark, _MARK):
+        if "listed" in _read(mark, ANY):
             yield mark
 
 
 def _listed_section(mark: Path) -> dict:
     """A report that has its files, on the page: its first table, as its `sources.json` has it."""
-    content = _read(mark, _MARK)
+    content = _read(mark, _LISTED)
     rows = content["listed"]
     wide = [text[:_WIDE] for text in rows["body"]]
     return {
@@ -380,14 +371,22 @@ def _listed_section(mark: Path) -> dict:
 
 def _changed(folder: Path) -> list[str]:
     """Files of such a report that are not those whose hashes it holds."""
-    recorded = _read(folder / MARK, _MARK).get("files", {})
-    present = {path.name: digest(path) for path in sorted(folder.iterdir()) if path.name != MARK}
-    missing = {name for name in recorded.keys() - present.keys() if not name.endswith(_MADE_ANEW)}
-    changed = {name for name in recorded.keys() & present.keys() if recorded[name] != present[name]}
-    return [
-        *(f"{folder / name} is missing; {_REBUILD}" for name in sorted(missing)),
-        *(f"{folder / name} was changed; {_REBUILD}" for name in sorted(changed)),
-    ]
+    recorded = _read(folder / MARK, ANY)["files"]
+    there = {
+        name: sha256
+        for name, sha256 in recorded.items()
+        if not name.endswith(_MADE_ANEW) or (folder / name).is_file()
+    }
+    return _altered(folder, there)
+
+
+def _altered(folder: Path, recorded: Mapping[str, str]) -> Iterator[str]:
+    """Files of a report that are gone, or are not those whose sha256 its record has."""
+    for name, sha256 in sorted(recorded.items()):
+        if not (folder / name).is_file():
+            yield f"{folder / name} is missing; {_REBUILD}"
+        elif digest(folder / name) != sha256:
+            yield f"{folder / name} was changed; {_REBUILD}"
 
 
 def _benches(folder: Path) -> list[Path]:

@@ -1,4 +1,8 @@
-"""A folder that is replaced whole or not at all."""
+"""The folder of a report: its record, and how it is replaced, whole or not at all.
+
+A record is one of the same form in `sources.json`, beside a report's files, and for each report by name in
+`provenance.json` of a folder of reports.
+"""
 
 import json
 import shutil
@@ -9,7 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from nsf.errors import ConfigError, StorageError
+from nsf import schemas
+from nsf.errors import ConfigError, SchemaError, StorageError
 from nsf.manifest import digest
 from nsf.storage import locked
 
@@ -17,7 +22,24 @@ MARK = "sources.json"
 """The file by which a folder is known as a report: it names every other file of the folder."""
 
 PROVENANCE = "provenance.json"
-"""The file of a folder of reports that names what is committed of each."""
+"""The file of a folder of reports that has the record of each, as far as it is committed."""
+
+ANY = {"title": str, "files": {...: str}, "runs": {...: dict}}
+"""Of the record of any report: title, sha256 by file, origin by run id."""
+
+RECORD = ANY | {
+    "question": str,
+    "paper": str,
+    "missing": [str],
+    "plots": ([str], None),
+    "trained": {...: [dict]},
+    "logarithmic": [str],
+    "pictures": {...: {"caption": str, "runs": [str]}},
+}
+"""Of the record of a report of evaluate runs."""
+
+COMMITTED = RECORD | {"charts": {...: str}}
+"""Of the same where it is committed, with what tells whether its charts are as the table has them."""
 
 _PAGES = ("index.html", "index.md", "results.csv", "results.tex", "superresolution.csv")
 _MOST_BYTES = 2**26  # of a record
@@ -66,7 +88,7 @@ def _of_others(folder: Path) -> str:
         return "it is a file"
     except PermissionError:
         return "it cannot be read"
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError):
+    except (OSError, SchemaError):
         return f"its {MARK} is of another program"
     if others and not (folder / MARK).exists():
         return f"it has no {MARK}"
@@ -75,31 +97,22 @@ def _of_others(folder: Path) -> str:
 
 def _recorded(folder: Path) -> set[str]:
     """Names of the files that a report's own record has."""
-    content = _read(folder / MARK)
-    if [type(content[key]) for key in ("title", "runs", "files")] != [str, dict, dict]:
-        raise TypeError(MARK)
-    return set(content["files"])
+    return set(schemas.read(folder / MARK, ANY, _MOST_BYTES)["files"])
 
 
 def _committed(folder: Path) -> set[str]:
-    """Names of the files of a report whose pictures a folder of reports above names; none of others.
+    """Names of the files of a report that a folder of reports above has the record of; none of others.
 
     They are its pictures, the same as SVG, and the pages and tables that `nsf reports` makes of it.
     """
     for reports in folder.parents[:2]:
         if (reports / PROVENANCE).is_file():
-            record = _read(reports / PROVENANCE)
-            paths = [reports / path for key in ("pictures", "charts") for path in record.get(key, {})]
-            pictures = [path for path in paths if path.parent == folder]
-            files = {path.with_suffix(kind).name for path in pictures for kind in (".png", ".svg")}
+            records = schemas.read(reports / PROVENANCE, {...: COMMITTED}, _MOST_BYTES)
+            record = records.get(folder.relative_to(reports).as_posix(), {})
+            pictures = {Path(file) for key in ("pictures", "charts") for file in record.get(key, {})}
+            files = {str(file.with_suffix(kind)) for file in pictures for kind in (".png", ".svg")}
             return files | {*_PAGES} if files else set()
     return set()
-
-
-def _read(path: Path) -> dict:
-    if path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"{path} is too large")
-    return json.loads(path.read_bytes())
 
 
 def _no_place(folder: Path, error: OSError) -> StorageError:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 _ROWS, _ENDS = 6, 2  # cases of final shapes, and of strips and films
 _FILMS = 6 * 2**20  # [bytes] of all on a page
+_FRAMES, _WIDTH = 31, 380  # of a film at most; of one picture of two [pixel]
 _MANY = 16  # bodies and models beyond which each has only its strip
 _TOP = 99.0  # [%] percentile at which a colour scale ends
 _FINE = "superresolution.png"
@@ -317,23 +318,19 @@ def strip(cases: Sequence[Shown], count: int = 5) -> Figure:
     return bodies.strip(rows, cases[0].motion.t, count, hides_stress(cases[0].motion))
 
 
-def animation(
-    cases: Sequence[Shown], path: Path, frames: int = 31, width: int = 380, max_bytes: int = GIF_BYTES
-) -> None:
+def animation(cases: Sequence[Shown], path: Path, max_bytes: int = GIF_BYTES) -> None:
     """Write a film: the models side by side, cut open, coloured by stress, with the time.
 
     Args:
         cases: one or two, a row each.
         path: of the film.
-        frames: at most this many, evenly spread over the simulated time.
-        width: of one picture of two [pixel].
         max_bytes: of a GIF at most.
     """
     stress = _stress_scale([case.motion.stress_full for case in cases])
     models = [list(case.rows(stress)) for case in cases]
     titles = [model for model, _ in max(models, key=len)]
     rows = [[body for _, body in row] for row in models]
-    images = bodies.frames(rows, cases[0].motion.t, titles, frames, 2 * width, cut=True)
+    images = bodies.frames(rows, cases[0].motion.t, titles, _FRAMES, 2 * _WIDTH, cut=True)
     bodies.film(images, path, most=max_bytes)
 
 

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from nsf.results.columns import axis
 from nsf.results.style import FULL, GRID, INK, MUTED, PALETTE, figure, legend, line_style, panels, styled
+from nsf.vectors import drawn
 
 _BODY = 1500  # particles that show a body
 _RUNS = {"fitted": "run by recurrence", "full_order": "full-order run"}
@@ -23,8 +24,8 @@ def trials_chart(table: pd.DataFrame, units: Mapping[tuple[str, str], str]) -> F
     """
     groups = list(table.groupby(["scene", "parameter"], sort=False))
     with styled():
-        fig, drawn = panels(len(groups), 3.4, 2)
-        for panel, ((scene, name), part) in zip(drawn, groups, strict=True):
+        fig, each = panels(len(groups), 3.4, 2)
+        for panel, ((scene, name), part) in zip(each, groups, strict=True):
             for holds, trials in part.groupby("inside_90", sort=False):
                 bars = [trials["estimate"] - trials["lower"], trials["upper"] - trials["estimate"]]
                 panel.errorbar(
@@ -50,7 +51,7 @@ def points_chart(body: np.ndarray, observed: np.ndarray, fitted: np.ndarray, t: 
     Args:
         body: [P, 3] m; observed, fitted: [n, 3] m, NaN where an axis was not observed; t: when [s].
     """
-    shown = body[np.random.default_rng(0).permutation(len(body))[:_BODY]]
+    shown = body[drawn(len(body), _BODY)]
     with styled():
         fig = figure(4.4)
         for panel, (i, j) in zip(fig.subplots(1, 2), ((0, 2), (0, 1)), strict=True):

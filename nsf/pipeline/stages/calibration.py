@@ -23,7 +23,7 @@ from nsf.vectors import spaced
 
 #: Why a run of a validation case has no bound.
 CALIBRATES = "validation cases say how large errors are"
-_PARTICLES, _FRAMES = 500, 51
+_FRAMES = 51
 
 
 def calibrated(pipeline, manifold: Manifold) -> Trust:
@@ -56,9 +56,7 @@ def _rollouts(validating, manifold: Manifold) -> list[Rollout]:
 
 def _calibration(validating, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Calibration:
     """Errors of runs of validation cases, beside what these runs say of themselves."""
-    particles = np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_PARTICLES])
-    at = manifold.restrict(torch.as_tensor(particles), device=manifold.X.device)
-    rows = []
+    (particles, at), rows = manifold.at_some(), []
     for rollout in rollouts:
         with contextlib.closing(
             Trajectory.open(validating.truth(rollout.case).require().file(TRAJECTORY))

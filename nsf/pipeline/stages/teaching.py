@@ -26,8 +26,7 @@ from nsf.storage import writing
 
 #: File of a teach run: of a recurrence, and of any other model.
 RECURRENCE, FITTED = "recurrence.pt", "model.pt"
-#: Particles, and frames at most, at which validation runs are compared.
-_PARTICLES, _FRAMES = 500, 50
+_FRAMES = 50  # at most, at which validation runs are compared
 
 
 def teach(pipeline, run: Run) -> None:
@@ -134,8 +133,7 @@ def loaded_file(path: Path) -> Any:
 def _yardstick(pipeline, manifold: Manifold, lessons: Lessons) -> Yardstick:
     """The validation runs that choose the weights."""
     model, steps = pipeline.model, pipeline.scene.steps
-    stride, particles = model.stride_of(steps), len(manifold.X)
-    particles = np.sort(np.random.default_rng(0).permutation(particles)[:_PARTICLES])
+    stride, (particles, at) = model.stride_of(steps), manifold.at_some()
     stored, truth = pipeline.config.data.every, []
     together = math.lcm(stride, stored)  # steps between frames that are stored and end a stride
     apart = together * max(1, steps // together // _FRAMES)
@@ -143,7 +141,6 @@ def _yardstick(pipeline, manifold: Manifold, lessons: Lessons) -> Yardstick:
         with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
             frames = list(range(0, trajectory.frames, apart // stored))
             truth.append(torch.as_tensor(trajectory.read("x", frames=frames, particles=particles)))
-    at = manifold.restrict(torch.as_tensor(particles), device=manifold.X.device)
 
     def positions(xhat: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():

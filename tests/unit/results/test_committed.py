@@ -56,8 +56,8 @@ def test_rows_of_all_reports_are_one_table(folder):
     frame = table.read(folder / "results.csv")
     assert frame.groupby("report")["delta"].mean().to_dict() == {"noise/weak": 0.02, "table1/seeds": 0.01}
     content = json.loads((folder / "provenance.json").read_text())
-    assert set(content["runs"]) == set(frame["run"])
-    assert set(content["pictures"]) == {"noise/weak/strip.png", "table1/seeds/strip.png"}
+    assert {run for record in content.values() for run in record["runs"]} == set(frame["run"])
+    assert [set(record["files"]) for record in content.values()] == [{"strip.png"}, {"strip.png"}]
 
 
 def test_a_report_that_is_made_anew_takes_the_place_of_its_rows(folder, tmp_path):
@@ -128,8 +128,11 @@ def test_a_chart_that_no_report_has_any_more_is_noticed(folder):
 
 
 def test_a_half_written_provenance_is_refused(folder):
-    (folder / "provenance.json").write_text('{"runs": {}}')
-    with pytest.raises(SchemaError, match=r"provenance\.json: it lacks reports; .* take it from git"):
+    (folder / "provenance.json").write_text('{"noise/weak": {}}')
+    with pytest.raises(SchemaError, match=r"provenance\.json: noise/weak lacks title; .* take it from git"):
+        committed.faults(folder)
+    (folder / "provenance.json").write_text("{}")
+    with pytest.raises(SchemaError, match=r"provenance\.json has no record of noise/weak; take it from git"):
         committed.faults(folder)
 
 
@@ -138,7 +141,9 @@ def test_a_report_with_files_of_its_own_is_listed_and_checked(folder):
     own.mkdir()
     (own / "index.md").write_text("# Calibration")
     listed = {"headings": ["", "off"], "body": [["a", "1"]], "numeric": [False, True], "made": "1 run."}
-    (own / "sources.json").write_text(json.dumps({"title": "Calibration", "listed": listed, "files": {}}))
+    (own / "sources.json").write_text(
+        json.dumps({"title": "Calibration", "listed": listed, "files": {}, "runs": {}})
+    )
     committed.write_list(folder)
     assert "### Calibration" in (folder / "index.md").read_text()
     content = json.loads((own / "sources.json").read_text()) | {"files": {"index.md": "0", "page.html": "0"}}

@@ -60,8 +60,13 @@ def test_a_report_of_a_fresh_clone_is_replaced(report):
     """Of a committed report there are some files, which provenance.json names, and no record of its own."""
     (report / MARK).unlink()
     (report / "delta.png").touch()
-    record = {"charts": {"heap/delta.png": "00"}, "pictures": {"other/thesis.tex": {}}}
-    (report.parent / "provenance.json").write_text(json.dumps(record))
+    texts = {"question": "How far?", "paper": "", "missing": [], "plots": None}
+    empty = {**CONTENT, **texts, "trained": {}, "logarithmic": [], "pictures": {}, "charts": {}}
+    records = {
+        "heap": {**empty, "charts": {"delta.png": "00"}},
+        "other": {**empty, "files": {"thesis.tex": "0"}},
+    }
+    (report.parent / "provenance.json").write_text(json.dumps(records))
     check_place(report)
     (report / "thesis.tex").touch()
     with pytest.raises(ConfigError, match=f"it has no {MARK}"):
