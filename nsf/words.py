@@ -67,6 +67,13 @@ def number(key: str, value: str) -> float:
     return float(value)
 
 
+def positive(key: str, value: str) -> float:
+    """A decimal number above 0."""
+    if (read := number(key, value)) <= 0.0:
+        raise ConfigError(f"{key}={value} must be positive")
+    return read
+
+
 def whole(least: int = 1, most: int = 10_000_000) -> Reader:
     """Reads a whole number from `least` to `most`."""
 

@@ -10,7 +10,7 @@ from nsf.config.composing import (
     resolve,
 )
 from nsf.config.keys import naming_the_missing, replaced, section
-from nsf.config.sweeps import check_sweep, jobs, scene_of
+from nsf.config.sweeps import check_sweep, grammar, jobs, scene_of
 from nsf.config.targets import build, build_all
 from nsf.scalars import length, number, text
 
@@ -19,6 +19,7 @@ __all__ = [
     "build_all",
     "check_sweep",
     "checked",
+    "grammar",
     "jobs",
     "launching",
     "length",

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -70,6 +71,15 @@ def _values(override: Override) -> list[str]:
     if len(values) > _MOST_JOBS:
         raise ConfigError(f"{override.input_line} has more than {_MOST_JOBS} values; give fewer")
     return values
+
+
+def grammar(value: Any) -> str:
+    """A plain value in Hydra's grammar."""
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(grammar, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{grammar(one)}" for key, one in value.items()) + "}"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def check_sweep(

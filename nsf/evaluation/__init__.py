@@ -2,7 +2,7 @@
 
 from nsf.evaluation.compare import Comparison, at_frames, compare
 from nsf.evaluation.cost import SolverCost, Subject, decoding_ms, measure
-from nsf.evaluation.metrics import deformation_error, displacement_error, reduction_ratio, stress_error
+from nsf.evaluation.metrics import deformation_error, displacement_error, stress_error
 from nsf.evaluation.rivals import Rivals, coarse_subjects, rivals
 from nsf.evaluation.superresolution import SuperResolution, query, superresolve
 
@@ -20,7 +20,6 @@ __all__ = [
     "displacement_error",
     "measure",
     "query",
-    "reduction_ratio",
     "rivals",
     "stress_error",
     "superresolve",

@@ -158,8 +158,3 @@ def momentum_error(
         scale: Σ m |v| (or Σ m |x| |v|) of the full-order frames: the momenta themselves may cancel.
     """
     return (rom - fom).norm(dim=1) / scale.max()
-
-
-def reduction_ratio(particles: int, latent_dim: int) -> float:
-    """γ = 3|P|/r, full-order over latent dimension (paper section 6)."""
-    return 3.0 * particles / latent_dim

@@ -2,12 +2,15 @@
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nsf.errors import ConfigError
 from nsf.export import FORMATS
+from nsf.live.command import Parser
 from nsf.paths import reports_folder
+from nsf.words import positive, text, whole
 
 if TYPE_CHECKING:
     from nsf.export.playback import Playback
@@ -32,13 +35,8 @@ LIVE = "live"  # the format that holds the model in place of a run
 _OF_PLAYBACKS = ("parameter", "color", "every", "fps")
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str):
-        raise ConfigError(f"{message}; see `nsf export --help`")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="nsf export",
         description=_DESCRIPTION,
         epilog=_EXAMPLES,
@@ -52,17 +50,22 @@ def _parser() -> argparse.ArgumentParser:
     for name, tells in FORMATS.items():
         parser.add_argument(f"--{name}", action="store_true", help=tells)
     arguments = (
-        ("parameter", str, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
-        ("points", int, None, "how many; more than the particles are points in between (super-resolution)"),
-        ("color", str, None, "von_mises, the default, or displacement"),
-        ("every", int, None, "takes each EVERY-th step; all by default"),
-        ("fps", float, None, "frames shown a second (30)"),
-        ("device", str, "auto", "where the fields are decoded: cpu, cuda, cuda:N or auto"),
-        ("output", Path, None, "folder; export/<scene>-<hash> in ./reports (NSF_REPORTS) by default"),
+        ("parameter", text, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
+        (
+            "points",
+            whole(),
+            None,
+            "how many; more than the particles are points in between (super-resolution)",
+        ),
+        ("color", text, None, "von_mises, the default, or displacement"),
+        ("every", whole(), None, "takes each EVERY-th step; all by default"),
+        ("fps", positive, None, "frames shown a second (30)"),
+        ("device", text, "auto", "where the fields are decoded: cpu, cuda, cuda:N or auto"),
+        ("output", text, None, "folder; export/<scene>-<hash> in ./reports (NSF_REPORTS) by default"),
     )
-    for name, kind, default, tells in arguments:
-        text = tells if default is None else f"{tells} ({default})"
-        parser.add_argument(f"--{name}", type=kind, default=default, help=text)
+    for name, reader, default, tells in arguments:
+        shown = tells if default is None else f"{tells} ({default})"
+        parser.add_argument(f"--{name}", type=partial(reader, f"--{name}"), default=default, help=shown)
     return parser
 
 
@@ -91,7 +94,7 @@ def main(arguments: Sequence[str]) -> int:
     writers = {name: importlib.import_module(f"nsf.export.{name}") for name in formats if name != LIVE}
     for needed in (module for writer in writers.values() for module in writer.NEEDS):
         optional(needed, "export")  # before any work
-    folder = options.output or reports_folder() / "export" / f"{run.scene}-{run.hash}"
+    folder = Path(options.output or reports_folder("export", f"{run.scene}-{run.hash}"))
     if writers:
         playback = _playback(run, options)
     for name, writer in writers.items():
@@ -104,11 +107,9 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _check(options: argparse.Namespace, formats: Sequence[str]) -> None:
-    """Refuse no format, no points, and options that no format takes."""
+    """Refuse no format, and options that no format takes."""
     if not formats:
         raise ConfigError(f"no format; give one or more of {', '.join(f'--{name}' for name in FORMATS)}")
-    if options.points is not None and options.points < 1:
-        raise ConfigError(f"points={options.points} must be a whole number of at least 1")
     unused = [f"--{name}" for name in _OF_PLAYBACKS if getattr(options, name) is not None]
     if formats == [LIVE] and unused:
         raise ConfigError(

@@ -22,15 +22,6 @@ _HEAD = 4096  # letters of the line of names
 _TEXT_BYTES = 64  # of a quantity's name
 _HDF5 = (".h5", ".hdf5")
 _MISSING = ("", "nan", "na")
-#: First bytes of files that are no text.
-_KINDS = {
-    b"\x1f\x8b": "packed by gzip; name it .csv.gz",
-    b"BZh": "packed by bzip2; unpack it, or give a csv.gz",
-    b"\xfd7zXZ": "packed by xz; unpack it, or give a csv.gz",
-    b"PK": "packed by zip; unpack it, or give a csv.gz",
-    b"\x28\xb5\x2f\xfd": "packed by zstd; unpack it, or give a csv.gz",
-    b"\x89HDF": "HDF5; name it .h5",
-}
 
 
 def read_columns(path: Path | str) -> dict[str, np.ndarray]:
@@ -80,7 +71,9 @@ def _of_csv(path: Path) -> dict[str, np.ndarray]:
     try:
         text = _text(path).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is no UTF-8 text; save it as CSV in UTF-8") from error
+        raise ConfigError(
+            f"{path} is no UTF-8 text; save it as .csv in UTF-8, as .csv.gz packed by gzip, or as .h5 of HDF5"
+        ) from error
     except (OSError, EOFError, zlib.error) as error:
         raise SchemaError(
             f"{path} is damaged or cannot be read; write it again ({first_line(error)})"
@@ -104,14 +97,9 @@ def _text(path: Path) -> bytes:
     """The bytes of a file of text, unpacked.
 
     Raises:
-        ConfigError: it is none, or holds too many.
+        ConfigError: it holds too many.
     """
-    packed = path.suffix == ".gz"
-    with path.open("rb") as raw:
-        head = raw.read(8)
-    if kinds := [kind for first, kind in _KINDS.items() if head.startswith(first) and not packed]:
-        raise ConfigError(f"{path} is {kinds[0]}")
-    with (gzip.open if packed else open)(path, "rb") as file:
+    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as file:
         text = file.read(_MOST_BYTES + 1)
     if len(text) > _MOST_BYTES:
         raise ConfigError(

@@ -4,7 +4,8 @@ import argparse
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
@@ -12,6 +13,7 @@ from nsf.errors import ConfigError
 from nsf.extras import optional
 from nsf.live import LOOPBACK
 from nsf.runs import Run
+from nsf.words import positive, whole
 
 if TYPE_CHECKING:
     from nsf.live.player import Player
@@ -19,8 +21,11 @@ if TYPE_CHECKING:
 PORTS = {"view": 8080, "serve": 8765}
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
+    """Of options with dashes, which are refused as words are."""
+
     def error(self, message: str):
+        """Refuse the options."""
         raise ConfigError(f"{message}; see `{self.prog} --help`")
 
 
@@ -104,7 +109,7 @@ def _bench(command: str, player: "Player", options: argparse.Namespace) -> None:
 
 
 def _parser(command: str, text: str) -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog=f"nsf {command}", description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     add = parser.add_argument
@@ -112,15 +117,20 @@ def _parser(command: str, text: str) -> argparse.ArgumentParser:
         "run", nargs="?", default="", metavar="RUN", help="deploy run, or the beginning of its id; the newest"
     )
     add("--host", default="127.0.0.1", help="address to serve at")
-    add("--port", type=_number(int, 0, 65535), default=PORTS[command], help="to serve at; 0 takes a free one")
-    add("--points", type=_number(int, 1), default=6000, help="most particles that are shown")
+    add(
+        "--port",
+        type=partial(whole(0, 65535), "--port"),
+        default=PORTS[command],
+        help="to serve at; 0 takes a free one",
+    )
+    add("--points", type=partial(whole(), "--points"), default=6000, help="most particles that are shown")
     add("--device", default="auto", help="of the reduced run: cpu, cuda, cuda:N or auto")
     add(
         "--token",
         help="that whoever joins must give, 16 letters at least; drawn unless only this machine can join",
     )
-    add("--rate", type=_number(float, 0.0), default=30.0, help="frames a second")
-    add("--patience", type=_number(float, 0.0), default=5.0, help="seconds that a client may lag")
+    add("--rate", type=partial(positive, "--rate"), default=30.0, help="frames a second")
+    add("--patience", type=partial(positive, "--patience"), default=5.0, help="seconds that a client may lag")
     if command == "view":
         add("--bench", action="store_true", help="measure how fast the slider is followed, and end")
     else:
@@ -128,24 +138,5 @@ def _parser(command: str, text: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _number(kind: type, least: float, most: float = float("inf")) -> Callable[[str], float]:
-    """Reads a number: a whole one of at least `least`, or a finite one above it."""
-
-    def read(text: str) -> float:
-        try:
-            value = kind(text)
-        except ValueError:
-            needed = {int: "a whole number", float: "a number"}[kind]
-            raise argparse.ArgumentTypeError(f"{text!r} must be {needed}") from None
-        if kind is float and not least < value < most:
-            raise argparse.ArgumentTypeError(f"{text} must be positive and finite")
-        if not least <= value <= most:
-            needed = f"lie in [{least}, {most}]" if most < float("inf") else f"be at least {least}"
-            raise argparse.ArgumentTypeError(f"{text} must {needed}")
-        return value
-
-    return read
-
-
 def _counts(text: str) -> list[int]:
-    return [int(_number(int, 1)(part)) for part in text.split(",")]
+    return [whole()("--bench", part) for part in text.split(",")]

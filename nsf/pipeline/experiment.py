@@ -356,23 +356,11 @@ def _printed(entries, where: str) -> tuple[dict, ...] | None:
     ):
         raise ConfigError(f"{where}: printed must be a list of mappings, each with a number delta")
     return tuple(
-        {str(key): value if key == "delta" else _text(value) for key, value in entry.items()}
+        {str(key): value if key == "delta" else configuration.grammar(value) for key, value in entry.items()}
         for entry in entries
     )
 
 
 def _values(value) -> str:
     """A value, or a list of values to be taken in turn, in Hydra's grammar."""
-    return ",".join(map(_text, value)) if isinstance(value, list) else _text(value)
-
-
-def _text(value) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return f"[{','.join(map(_text, value))}]"
-    if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_text(v)}" for key, v in value.items()) + "}"
-    return str(value)
+    return ",".join(map(configuration.grammar, value if isinstance(value, list) else [value]))

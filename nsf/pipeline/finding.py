@@ -29,7 +29,7 @@ def find(*words: str, stage: str = "train", root: str | Path | None = None, **ke
     """
     if stage not in _STAGES:
         raise ConfigError(f"stage={stage} is none of {', '.join(_STAGES)}")
-    overrides = [*words, *(f"{key}={_hydra(value)}" for key, value in keys.items())]
+    overrides = [*words, *(f"{key}={config.grammar(value)}" for key, value in keys.items())]
     if not any(map(config.names_scene, overrides)):
         raise ConfigError('name a scene, as scene="sand"')
     pipeline = Pipeline(config.load(overrides), root=None if root is None else Path(root))
@@ -50,12 +50,3 @@ def _differing(run: Run, other: Run) -> str:
     pairs = [f"{key}={value}" for key, value in flat(other.config).items() if settings.get(key) != value]
     shown = ", ".join(pairs[:_MOST]) + (", …" if len(pairs) > _MOST else "")
     return shown or "made from other runs"
-
-
-def _hydra(value: Any) -> str:
-    """A value in Hydra's grammar."""
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(_hydra, value))}]"
-    if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_hydra(one)}" for key, one in value.items()) + "}"
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

@@ -27,7 +27,7 @@ from nsf.results import report, table
 from nsf.results.charts import CHARTS, View
 from nsf.results.charts.cases import COLORS
 from nsf.results.columns import COLUMNS
-from nsf.results.folder import ANY, COMMITTED, MARK, PROVENANCE, RECORD
+from nsf.results.folder import ANY, COMMITTED, MARK, PROVENANCE, RECORD, read
 from nsf.results.formats import Rows, markdown_document
 from nsf.results.page import Picture, Section
 from nsf.results.question import Question
@@ -84,7 +84,7 @@ class Reports:
             SchemaError: the table is none, or `provenance.json` lacks a key.
         """
         path = folder / PROVENANCE
-        records = _read(path, {...: COMMITTED}) if path.is_file() else {}
+        records = read(path, {...: COMMITTED}) if path.is_file() else {}
         frame = table.read(folder / TABLE) if (folder / TABLE).is_file() else pd.DataFrame(columns=[*COLUMNS])
         if lost := set(frame["report"]) - records.keys():
             raise SchemaError(
@@ -96,14 +96,14 @@ class Reports:
         """With every report that `nsf report` wrote below the folder, each in the place of its older rows."""
         frame, records = self.frame, dict(self.records)
         for mark in sorted(self.folder.rglob(f"*/{MARK}")):
-            if "listed" in _read(mark, ANY) or not not_ignored([mark.with_name("delta.png")]):
+            if "listed" in read(mark) or not not_ignored([mark.with_name("delta.png")]):
                 continue
             name = mark.parent.relative_to(self.folder).as_posix()
             rows = table.read(mark.with_name(TABLE)).assign(report=name)
             others = frame[frame["report"] != name]
             frame = pd.concat([others, rows], ignore_index=True) if len(others) else rows
             charts = records.get(name, {}).get("charts", {})
-            records[name] = _of_pictures(_read(mark, RECORD)) | {"charts": charts}
+            records[name] = _of_pictures(read(mark, RECORD)) | {"charts": charts}
         return replace(self, frame=frame, records=records)
 
     def save(self) -> None:
@@ -339,23 +339,16 @@ def _made(reports: Reports, name: str) -> str:
     return f"{len(runs)} run{'s' * (len(runs) > 1)}, {scales} scale, {', '.join(devices)}, {commits}"
 
 
-def _read(path: Path, schema: Mapping) -> dict:
-    try:
-        return schemas.read(path, schema)
-    except SchemaError as error:
-        raise SchemaError(f"{path.parent}: {error}; write the report again, or take it from git") from error
-
-
 def _listed(folder: Path) -> Iterator[Path]:
     """Marks of reports that have files of their own, as of inverse problems."""
     for mark in not_ignored(sorted(folder.rglob(MARK))):
-        if "listed" in _read(mark, ANY):
+        if "listed" in read(mark):
             yield mark
 
 
 def _listed_section(mark: Path) -> dict:
     """A report that has its files, on the page: its first table, as its `sources.json` has it."""
-    content = _read(mark, _LISTED)
+    content = read(mark, _LISTED)
     rows = content["listed"]
     wide = [text[:_WIDE] for text in rows["body"]]
     return {
@@ -371,7 +364,7 @@ def _listed_section(mark: Path) -> dict:
 
 def _changed(folder: Path) -> list[str]:
     """Files of such a report that are not those whose hashes it holds."""
-    recorded = _read(folder / MARK, ANY)["files"]
+    recorded = read(folder / MARK)["files"]
     there = {
         name: sha256
         for name, sha256 in recorded.items()

@@ -45,6 +45,18 @@ _PAGES = ("index.html", "index.md", "results.csv", "results.tex", "superresoluti
 _MOST_BYTES = 2**26  # of a record
 
 
+def read(path: Path, schema: Mapping = ANY) -> dict[str, Any]:
+    """The record of a report, or those of a folder of reports.
+
+    Raises:
+        SchemaError: it is none.
+    """
+    try:
+        return schemas.read(path, schema, _MOST_BYTES)
+    except SchemaError as error:
+        raise SchemaError(f"{path.parent}: {error}; write the report again, or take it from git") from error
+
+
 def check_place(folder: Path) -> None:
     """Refuse a place where `replaced` could not put a report; the folder above it is made.
 
@@ -82,7 +94,8 @@ def _of_others(folder: Path) -> str:
     try:
         if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
             return ""
-        named = {MARK} | (_recorded(folder) if (folder / MARK).exists() else _committed(folder))
+        recorded = read(folder / MARK)["files"] if (folder / MARK).exists() else _committed(folder)
+        named = {MARK, *recorded}
         others = [path for path in sorted(folder.iterdir()) if path.name not in named or not path.is_file()]
     except NotADirectoryError:
         return "it is a file"
@@ -95,11 +108,6 @@ def _of_others(folder: Path) -> str:
     return f"no report wrote its {others[0].name}" if others else ""
 
 
-def _recorded(folder: Path) -> set[str]:
-    """Names of the files that a report's own record has."""
-    return set(schemas.read(folder / MARK, ANY, _MOST_BYTES)["files"])
-
-
 def _committed(folder: Path) -> set[str]:
     """Names of the files of a report that a folder of reports above has the record of; none of others.
 
@@ -107,7 +115,7 @@ def _committed(folder: Path) -> set[str]:
     """
     for reports in folder.parents[:2]:
         if (reports / PROVENANCE).is_file():
-            records = schemas.read(reports / PROVENANCE, {...: COMMITTED}, _MOST_BYTES)
+            records = read(reports / PROVENANCE, {...: COMMITTED})
             record = records.get(folder.relative_to(reports).as_posix(), {})
             pictures = {Path(file) for key in ("pictures", "charts") for file in record.get(key, {})}
             files = {str(file.with_suffix(kind)) for file in pictures for kind in (".png", ".svg")}

@@ -14,7 +14,7 @@ from typing import Any
 
 from nsf.errors import SchemaError
 from nsf.manifest import altered, digest
-from nsf.results.folder import MARK, plain
+from nsf.results.folder import ANY, MARK, plain, read
 from nsf.runs.run import Run
 
 FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")
@@ -72,11 +72,11 @@ def unchanged(folder: Path, runs: Iterable[Run], question: Question, first: Run 
     """The page of a report that would be written again as it is; None where something differs."""
     folder, runs = Path(folder), list(runs)
     try:
-        content = json.loads((folder / MARK).read_text(encoding="utf-8"))
-        files, same = dict(content["files"]), content["made_of"] == made_of(runs, question, first)
+        content = read(folder / MARK, ANY | {"made_of": str})
+        files, same = content["files"], content["made_of"] == made_of(runs, question, first)
         whole = {path.name for path in folder.iterdir()} - {MARK} == set(files)
         whole = whole and all(digest(folder / name) == sha256 for name, sha256 in files.items())
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, SchemaError):
+    except (OSError, SchemaError):
         return None
     outputs = [(run, output) for run in runs for output in run.manifest.get("outputs", ())]
     sound = not any(altered(Path(run.path), one) for run, one in outputs if one["path"] in FILES)

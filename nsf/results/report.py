@@ -103,9 +103,12 @@ def build_report(
         write_pages(question, fresh, sections, runs_of, view, fine, _warnings(sources))
         shown = [picture for section in sections for picture in section.pictures]
         content = {
-            "name": question.name,
             "made_of": made_of(runs, question, first),
-            **texts(question),
+            "title": question.title,
+            "question": question.text,
+            "paper": question.paper,
+            "missing": list(question.missing),
+            "plots": question.plots and list(question.plots),
             "runs": runs_of,
             "trained": view.trained,
             "logarithmic": sorted(view.logarithmic),
@@ -113,17 +116,6 @@ def build_report(
         }
         record(fresh, content)
     return Path(folder) / "index.html"
-
-
-def texts(question: Question) -> dict:
-    """Title, question and other texts of a report, for files."""
-    return {
-        "title": question.title,
-        "question": question.text,
-        "paper": question.paper,
-        "missing": list(question.missing),
-        "plots": None if question.plots is None else list(question.plots),
-    }
 
 
 def rows_of_runs(sources: Sequence[Source], question: Question) -> pd.DataFrame:

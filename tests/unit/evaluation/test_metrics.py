@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nsf.errors import ShapeError
-from nsf.evaluation import deformation_error, displacement_error, metrics, reduction_ratio, stress_error
+from nsf.evaluation import deformation_error, displacement_error, metrics, stress_error
 
 
 def tensor(values):
@@ -150,10 +150,3 @@ def test_momentum_error():
     fom = tensor([[0.0, 0, 0], [3.0, 0, 0]])
     rom = fom + tensor([[0, 0, 0], [0, 0.5, 0]])
     assert metrics.momentum_error(rom, fom, tensor([1.0, 10.0])).tolist() == [0.0, 0.05]
-
-
-def test_reduction_ratio():
-    """physics.md: cake 3·200 000/6, metal 29 987, toothpaste 3·45 412/6."""
-    assert reduction_ratio(200_000, 6) == 1e5
-    assert round(reduction_ratio(49_978, 5)) == 29_987
-    assert reduction_ratio(45_412, 6) == 22_706
