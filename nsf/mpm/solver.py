@@ -112,8 +112,6 @@ class FullOrderMPM:
         check_every: steps between looks at the particles.
         names: of the colliders, for `forcing`.
 
-    Attributes:
-
     Raises:
         InstabilityError: Δt is unstable, or a collider too fast; the message names the largest stable Δt.
         ConfigError: the grid does not resolve a collider.
