@@ -12,6 +12,7 @@ from pathlib import Path
 from nsf.errors import first_line
 from nsf.installed import entry_points
 from nsf.runs.provenance import provenance
+from nsf.storage import bytes_text, size_of
 
 _DEVELOPMENT = ("dev", "docs")  # extras that a user does not miss
 
@@ -89,14 +90,7 @@ def _weighed(folder: Path) -> str:
     folder = folder.expanduser()
     if not folder.is_dir():
         return f"{folder} (not there)"
-    size = 0
-    for path, _, names in os.walk(folder):
-        for name in names:
-            try:
-                size += os.lstat(os.path.join(path, name)).st_size
-            except OSError:  # removed while we look
-                continue
-    return f"{folder} ({size / 2**20:,.1f} MiB)"
+    return f"{folder} ({bytes_text(size_of(folder))})"
 
 
 def _extras() -> Iterator[str]:

@@ -3,12 +3,13 @@
 import errno
 import hashlib
 import json
+import math
 import os
 import shutil
 import stat
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,17 @@ def _acquired(lock: FileLock, waiting: Callable[[], object] | None) -> bool:
     return True
 
 
+def write_text(path: str | Path, text: str) -> Path:
+    """Write a text in UTF-8, whole or not at all, and give its path.
+
+    Raises:
+        StorageError: the file could not be written.
+    """
+    with writing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
 def write_json(path: str | Path, value: Any) -> None:
     """Write `value` as JSON, whole or not at all.
 
@@ -206,9 +218,7 @@ def write_json(path: str | Path, value: Any) -> None:
         StorageError: the file could not be written.
         ValueError: a number is not finite, which JSON cannot hold.
     """
-    text = json.dumps(value, indent=2, allow_nan=False)
-    with writing(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def require_folder(folder: str | Path) -> None:
@@ -238,6 +248,23 @@ def require_space(path: str | Path, size: int) -> None:
     if size > free:
         fault = f"it needs {size / 2**20:.1f} MiB and the disk has {free / 2**20:.1f} MiB free"
         raise _storage_error(Path(path), fault, _SPACE)
+
+
+def size_of(path: str | Path) -> int:
+    """[byte] of a file, or of all files below a folder, but for those that are removed meanwhile."""
+    path = Path(path)
+    files = [path] if path.is_file() else (Path(at, name) for at, _, names in os.walk(path) for name in names)
+    total = 0
+    for file in files:
+        with suppress(OSError):
+            total += file.lstat().st_size
+    return total
+
+
+def bytes_text(count: float) -> str:
+    """Bytes as a reader takes them in: 1.4 GiB."""
+    power = min(4, int(math.log(max(count, 1), 1024)))
+    return f"{count / 1024**power:.3g} {('B', 'KiB', 'MiB', 'GiB', 'TiB')[power]}"
 
 
 def _flush(path: Path) -> None:

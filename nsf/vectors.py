@@ -22,6 +22,11 @@ def drawn(count: int, most: int) -> np.ndarray:
     return np.sort(np.random.default_rng(0).permutation(count)[:most])
 
 
+def at_times(t, times, rows) -> np.ndarray:
+    """Rows [n, q] at times [n], ascending, at other times t [...]: [..., q], linear between them."""
+    return np.stack([np.interp(t, times, column) for column in np.transpose(rows)], axis=-1)
+
+
 def is_list(values) -> bool:
     """Whether values are several, of a yaml or of Python."""
     return isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)

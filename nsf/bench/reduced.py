@@ -21,6 +21,7 @@ from nsf.evaluation import metrics
 from nsf.evaluation.cost import SolverCost, Subject, measure
 from nsf.kinematics.fields.networks import ARITHMETIC
 from nsf.pipeline import Pipeline
+from nsf.vectors import at_times
 
 #: How sample particles are chosen in another case of a scene, beside the scene's own way.
 OTHER_SAMPLER = {"cake": "region", "metal": "cells"}
@@ -216,9 +217,9 @@ def error_of_latents(
         position: x̂ [r] → [P, 3] [m]; truth: as for `deformation_error`.
         like: a tensor of the precision and device of `position`.
     """
-    columns, errors, norms = torch.as_tensor(xhat).cpu().numpy().T, [], []
+    rows, errors, norms = torch.as_tensor(xhat).cpu().numpy(), [], []
     for at, x in _frames(truth) if isinstance(truth, Path) else truth:
-        now = torch.as_tensor([float(np.interp(at, t, column)) for column in columns]).to(like)
+        now = torch.as_tensor(at_times(at, t, rows)).to(like)
         errors.append(metrics.frame_squares((position(now) - x.to(like))[None]))
         norms.append(metrics.frame_squares(x.to(like)[None]))
     return metrics.relative(torch.cat(errors), torch.cat(norms))

@@ -16,7 +16,7 @@ from nsf.results.charts.costs import bars
 from nsf.results.columns import axis, number
 from nsf.results.formats import Rows, markdown_document, terminal_table
 from nsf.results.style import INK, PALETTE, band, figure, legend, line_style, plain_ticks, save, styled
-from nsf.storage import writing
+from nsf.storage import write_text
 
 _LEAD = (
     "Time of a step, both sides of a ratio measured in one process turn by turn, after a warm-up, around a "
@@ -99,10 +99,7 @@ def write_report(folder: Path) -> Path:
     """Charts and index.md from the table of a folder."""
     frame = read(folder / FILE)
     devices = {device: _parts(folder, rows) for device, rows in frame.groupby("device", sort=False)}
-    page = folder / "index.md"
-    with writing(page) as partial:
-        partial.write_text(markdown_document("speed.md", lead=_LEAD, devices=devices), encoding="utf-8")
-    return page
+    return write_text(folder / "index.md", markdown_document("speed.md", lead=_LEAD, devices=devices))
 
 
 def _parts(folder: Path, rows: pd.DataFrame) -> list[dict]:

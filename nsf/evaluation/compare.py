@@ -20,7 +20,7 @@ from nsf.evaluation.quantities import QUANTITIES, at_end, height
 from nsf.evaluation.surroundings import surroundings
 from nsf.kinematics.blocks import frames_at_once
 from nsf.mpm.grid.shape import DEGREES
-from nsf.vectors import spaced
+from nsf.vectors import at_times, spaced
 
 _VALUES = 90  # of a particle and frame that are held together: x, v, C and τ of three kinds
 _SAME_TIME = 1e-9  # [s]
@@ -58,12 +58,7 @@ class Comparison:
 
 def at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
     """Latent vectors [F, r] at the full-order frame times, linear between deployment steps."""
-    return _between(t, rollout.t, rollout.xhat)
-
-
-def _between(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Rows [n, q] at times [n], at other times t [F], linear between them."""
-    return np.stack([np.interp(t, times, column) for column in rows.T], axis=1)
+    return at_times(t, rollout.t, rollout.xhat)
 
 
 def bound_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
@@ -131,7 +126,7 @@ def compare(
     xhat, before, X, mass = map(tensor, (xhat, before, trajectory.X, trajectory.mass))
     rate = (xhat - before) / trajectory.dt
     rate[0] = solver.first_rate
-    stress = None if rollout.stress is None else tensor(_between(trajectory.t, rollout.t, rollout.stress))
+    stress = None if rollout.stress is None else tensor(at_times(trajectory.t, rollout.t, rollout.stress))
     latents = _Latents(xhat, before, rate, stress, trajectory.dt)
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
     shown_frames = spaced(frames, pictures[1])

@@ -10,6 +10,7 @@ from nsf.errors import ConfigError
 from nsf.export import FORMATS
 from nsf.live.command import Parser
 from nsf.paths import reports_folder
+from nsf.storage import bytes_text, size_of
 from nsf.words import positive, text, whole
 
 if TYPE_CHECKING:
@@ -130,10 +131,4 @@ def _playback(run: "Run", options: argparse.Namespace) -> "Playback":
 
 
 def _say(name: str, path: Path) -> None:
-    print(f"export: {name} → {path} ({_size(path) / 2**20:.1f} MiB)")
-
-
-def _size(path: Path) -> int:
-    """Bytes of a file, or of all in a folder."""
-    files = [path] if path.is_file() else path.rglob("*")
-    return sum(file.stat().st_size for file in files if file.is_file())
+    print(f"export: {name} → {path} ({bytes_text(size_of(path))})")

@@ -7,6 +7,7 @@ import numpy as np
 from nsf.errors import ConfigError
 from nsf.export.playback import QUANTITIES, Playback
 from nsf.live import page
+from nsf.storage import write_text
 
 NEEDS = ()
 POINTS = 20_000  # by default: a page of some MiB that a telephone plays
@@ -55,4 +56,4 @@ def write(playback: Playback, folder: Path) -> Path:
         "recordings": {"run": recorded},
     }
     data = page.packed(header, {f"run.{name}": array for name, array in arrays.items()})
-    return page.saved(folder / f"{playback.name}.html", page.html(playback.title, data))
+    return write_text(folder / f"{playback.name}.html", page.html(playback.title, data))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nsf.errors import ConfigError
 from nsf.live import page
+from nsf.storage import write_text
 
 #: Title of each model that is shipped; the first is shown unless another is asked for.
 MODELS = {
@@ -40,7 +41,7 @@ def show(model: str | None, folder: Path, opened: bool = True) -> Path:
         ConfigError: there is no such model.
     """
     model = next(iter(MODELS)) if model is None else model
-    path = page.saved(folder / f"{model}.html", page_of(model))
+    path = write_text(folder / f"{model}.html", page_of(model))
     if opened:
         webbrowser.open(path.resolve().as_uri())
     return path

@@ -13,7 +13,6 @@ import zlib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +20,6 @@ from markupsafe import Markup
 
 from nsf.bodies.colors import STRESS_COLORS, ColorScale
 from nsf.results.formats import HTML
-from nsf.storage import writing
 
 if TYPE_CHECKING:
     from nsf.mpm import Collider
@@ -99,13 +97,6 @@ def html(title: str, data: bytes = b"", connects: bool = False) -> str:
         script=Markup(script()),
         data=Markup(deflated),
     )
-
-
-def saved(path: Path, text: str) -> Path:
-    """Write a page; whole or not at all."""
-    with writing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-    return path
 
 
 def colors(cmap: str = STRESS_COLORS) -> list[int]:

@@ -23,7 +23,7 @@ from nsf.results.formats import file_name
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.scenes.programs import largest_tilt
-from nsf.storage import writing
+from nsf.storage import write_text, writing
 from nsf.vectors import spaced
 
 #: Points of a page, by default; a telephone decodes so many in each frame.
@@ -53,7 +53,7 @@ def write(run: Run, folder: Path, points: int | None = None, device: str = "auto
         raise ConfigError(
             f"the page would have {size / 1e6:.1f} MB, at most {LARGEST / 1e6:.0f}; give fewer --points"
         )
-    return page.saved(folder / f"{run.scene}-live.html", text)
+    return write_text(folder / f"{run.scene}-live.html", text)
 
 
 @dataclass(frozen=True)

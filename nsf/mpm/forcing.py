@@ -11,7 +11,7 @@ from nsf.errors import ConfigError
 from nsf.mpm.boundaries.colliders import Collider
 from nsf.mpm.boundaries.motion import Motion
 from nsf.mpm.precision import Precision
-from nsf.vectors import numbers, vector
+from nsf.vectors import at_times, numbers, vector
 
 if TYPE_CHECKING:
     from nsf.mpm.boundaries.arrays import BoundaryArrays
@@ -56,7 +56,7 @@ class Gravity:
 
     def at(self, t) -> np.ndarray:
         """[n, 3] gravity [m/s²] at times t [n] [s]."""
-        return np.stack([np.interp(t, self.times, column) for column in np.transpose(self.values)], -1)
+        return at_times(t, self.times, self.values)
 
 
 class Forcing:

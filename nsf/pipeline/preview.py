@@ -12,7 +12,7 @@ from rich.table import Table
 from nsf import config as configuration
 from nsf.pipeline.chain import Pipeline
 from nsf.runs import Run
-from nsf.runs.pruning import bytes_text
+from nsf.storage import bytes_text
 
 STAGES = ("simulate", "train", "teach", "deploy", "evaluate")
 #: Key whose value runs of a stage must share for their times to be compared.

@@ -34,7 +34,7 @@ from nsf.results.question import Question
 from nsf.results.style import fingerprint, save
 from nsf.runs.provenance import not_ignored
 from nsf.schemas import Maybe
-from nsf.storage import write_json, writing
+from nsf.storage import write_json, write_text
 
 TABLE, LIST, CONTENTS = "results.csv", "index.md", "contents.yaml"
 _COLUMNS = (
@@ -205,9 +205,7 @@ def write_list(folder: Path, pages: bool = False, questions: Mapping[str, Mappin
         records = {name: {**reports.records[name], "charts": _drawn(reports, name)} for name in reports.names}
         reports = replace(reports, records=records)
         reports.save()
-    with writing(folder / LIST) as partial:
-        partial.write_text(_page(reports), encoding="utf-8")
-    return folder / LIST
+    return write_text(folder / LIST, _page(reports))
 
 
 def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list[str]:

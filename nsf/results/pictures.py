@@ -23,7 +23,7 @@ from nsf.bodies.film import GIF_BYTES
 from nsf.results.charts import best
 from nsf.results.columns import BASELINE, model_name, number
 from nsf.results.page import Picture, Section
-from nsf.results.sources import Motion, Source, checked_hash
+from nsf.results.sources import Motion, Source
 from nsf.results.style import save
 from nsf.results.table import natural
 from nsf.vectors import spaced
@@ -219,10 +219,9 @@ def _motions(rows: pd.DataFrame, wanted: Sequence[str], sources: Mapping[str, So
 
 def _fine(of: str, run, frame: pd.DataFrame, folder: Path) -> Picture:
     """The picture that a superresolve run drew."""
-    checked_hash(run, _FINE)
     row = frame[frame["run"] == of].iloc[0]
     name = f"{row['scene']}-{row['field']}-{_FINE}"
-    shutil.copyfile(Path(run.path) / _FINE, folder / name)
+    shutil.copyfile(run.file(_FINE), folder / name)
     caption = "The last frame at the particles, at many more points, and of a full-order run of as many."
     return Picture([name], caption, [run.id])
 

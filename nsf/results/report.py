@@ -13,6 +13,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.errors import ConfigError
+from nsf.manifest import digest
 from nsf.progress import Progress
 from nsf.results import table
 from nsf.results.charts import CHARTS, View
@@ -30,7 +31,7 @@ from nsf.results.folder import record, replaced
 from nsf.results.formats import Rows, latex_table, spreadsheet
 from nsf.results.page import Page, Picture, Section, Table
 from nsf.results.question import Question, made_of
-from nsf.results.sources import KEPT, Source, checked_hash, open_sources
+from nsf.results.sources import KEPT, Source, open_sources
 from nsf.results.style import save
 from nsf.runs import Run
 from nsf.runs.columns import differing
@@ -275,9 +276,8 @@ def _fine_tables(frame: pd.DataFrame, question: Question, folder: Path) -> list[
     for of, run in question.fine.items():
         rows = frame[frame["run"] == of]
         if len(rows):
-            checked_hash(run, _FINE)
             head = {name: rows[name].iloc[0] for name in ("body", "variant")} | {"run": run.id}
-            path = Path(run.path) / _FINE
+            path = run.file(_FINE)
             parts.append(table.numbers(table.parsed(path, ("case",)), path, ("case",)).assign(**head))
     if not parts:
         return []
@@ -324,7 +324,7 @@ def _fine_origins(frame: pd.DataFrame, question: Question) -> dict[str, dict]:
     """The same of superresolve runs."""
     shown = [run for of, run in question.fine.items() if of in set(frame["run"])]
     return {
-        run.id: {key: run.manifest.get(key) for key in KEPT} | {"files": {_FINE: checked_hash(run, _FINE)}}
+        run.id: {key: run.manifest.get(key) for key in KEPT} | {"files": {_FINE: digest(run.file(_FINE))}}
         for run in shown
     }
 

@@ -15,7 +15,7 @@ import pandas as pd
 from nsf import schemas
 from nsf.data import archives
 from nsf.errors import MissingRunError, NSFError, SchemaError
-from nsf.manifest import altered
+from nsf.manifest import digest
 from nsf.results import table
 from nsf.results.question import FILES
 from nsf.runs import Run
@@ -84,7 +84,7 @@ class Source:
 
     def __init__(self, run: Run):
         self.run, self.id, self.manifest = run, run.id, run.manifest
-        self.hashes = {name: checked_hash(run, name) for name in FILES}
+        self.hashes = {name: digest(run.file(name)) for name in FILES}
         self.rows = table.complete(self._csv("results.csv", ("case",)), self._path("results.csv"))
         if self.rows.empty:
             raise SchemaError(f"{self._path('results.csv')} has no rows; run `nsf evaluate` again")
@@ -208,26 +208,6 @@ def open_sources(runs: Iterable[Run], first: Run | None = None) -> list[Source]:
         )
     chosen = first.id if first else None
     return sorted(sources, key=lambda s: (s.id == chosen, s.created, s.id), reverse=True)
-
-
-def checked_hash(run: Run, name: str) -> str:
-    """sha256 of a file of a run.
-
-    Raises:
-        SchemaError: the file is missing, or is not what the run's manifest records.
-    """
-    path = Path(run.path) / name
-    if not path.is_file():
-        raise SchemaError(
-            f"{path} is missing from {run.stage} run {run.id}; run `nsf {run.stage}` for it again"
-        )
-    recorded = {output["path"]: output for output in run.manifest.get("outputs", ())}.get(name)
-    if recorded is None or altered(Path(run.path), recorded):
-        raise SchemaError(
-            f"{path} is not the file that the manifest of {run.id} records: it was changed after the run; "
-            f"delete the run folder and run `nsf {run.stage}` again"
-        )
-    return recorded["sha256"]
 
 
 def _whole(run: Run, stage: str) -> list[Run]:

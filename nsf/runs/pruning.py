@@ -1,7 +1,5 @@
-"""Runs that can go: those from which nothing complete was made, and which no sweep needs; their size."""
+"""Runs that can go: those from which nothing complete was made, and which no sweep needs."""
 
-import math
-import os
 import re
 import shutil
 from collections.abc import Iterable, Sequence
@@ -77,16 +75,6 @@ def older(entries: Iterable[Entry], age: str) -> list[Entry]:
     return [e for e in entries if (at := e.values["created"]) and datetime.fromisoformat(at) < before]
 
 
-def size_of(run: Run) -> int:
-    """Bytes of all files in a run's folder."""
-    total = 0
-    for folder, _, names in os.walk(run.path):
-        for name in names:
-            with suppress(OSError):  # removed while we look
-                total += os.lstat(os.path.join(folder, name)).st_size
-    return total
-
-
 def remove(run: Run) -> None:
     """Delete a run's folder, and those above it that this leaves empty.
 
@@ -116,9 +104,3 @@ def _drop_empty(folder: Path, root: Path) -> None:
         while folder != root:
             folder.rmdir()
             folder = folder.parent
-
-
-def bytes_text(count: float) -> str:
-    """Bytes as a reader takes them in: 1.4 GiB."""
-    power = min(4, int(math.log(max(count, 1), 1024)))
-    return f"{count / 1024**power:.3g} {('B', 'KiB', 'MiB', 'GiB', 'TiB')[power]}"

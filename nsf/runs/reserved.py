@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nsf.errors import StorageError
 from nsf.runs.run import Run
-from nsf.storage import in_use, locked, writing
+from nsf.storage import in_use, locked, write_text
 
 _FOLDER = ".reserved"  # of a folder of runs: a list of ids and a lock for each living sweep
 _OWN: set[Path] = set()  # lists of this process
@@ -28,8 +28,7 @@ def reserving(runs: Iterable[Run]) -> Iterator[None]:
     lock = names.with_suffix(".lock")
     with locked(lock):
         try:
-            with writing(names) as partial:
-                partial.write_text("\n".join(ids), encoding="utf-8")
+            write_text(names, "\n".join(ids))
             _OWN.add(names)
             yield
         finally:

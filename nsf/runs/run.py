@@ -14,7 +14,7 @@ from nsf.errors import ConfigError, MissingRunError, SchemaError, StorageError
 from nsf.manifest import CONFIG, MANIFEST, NAME, altered, read_config, read_manifest
 from nsf.runs.provenance import provenance
 from nsf.runs.record import Record
-from nsf.storage import clear_partial, in_use, locked, writing
+from nsf.storage import clear_partial, in_use, locked, write_text
 
 FORMAT = 3  # of a folder and the keys of its configuration; a new value gives every run a new hash
 _LOCK = ".lock"
@@ -365,8 +365,7 @@ class Run:
         import yaml
 
         text = yaml.safe_dump(self.config, sort_keys=False, allow_unicode=True)
-        with writing(self.path / CONFIG) as partial:
-            partial.write_text(text, encoding="utf-8")
+        write_text(self.path / CONFIG, text)
 
 
 def _listed(runs: Sequence[Run], stage: str | None) -> str:

@@ -14,8 +14,9 @@ from nsf.errors import ConfigError, MissingRunError
 from nsf.runs import Run
 from nsf.runs.columns import differing, unit_of
 from nsf.runs.listing import entries
-from nsf.runs.pruning import bytes_text, prunable
+from nsf.runs.pruning import prunable
 from nsf.runs.reserved import reserved, reserving
+from nsf.storage import bytes_text
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from nsf.errors import ConfigError
 from nsf.extras import optional
-from nsf.storage import locked, writing
+from nsf.storage import locked, write_text
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger, MLFlowLogger
@@ -75,6 +75,5 @@ def _mlflow(folder: Path) -> MLFlowLogger:
             artifact_location=(trainings / "mlflow").as_uri(),
             run_id=_run_id(run_file),
         )
-        with writing(run_file) as partial:
-            partial.write_text(str(logger.run_id), encoding="utf-8")
+        write_text(run_file, str(logger.run_id))
     return logger

@@ -19,7 +19,7 @@ from nsf.models.drawn import Drawn
 from nsf.pipeline.stages.encoding import encoded_runs
 from nsf.recurrence.solids import collider_states
 from nsf.scenes import Scene, Values
-from nsf.vectors import spaced
+from nsf.vectors import at_times, spaced
 
 #: Why a run of a validation case has no bound.
 CALIBRATES = "validation cases say how large errors are"
@@ -66,7 +66,7 @@ def _calibration(validating, manifold: Manifold, trust: Trust, rollouts: Sequenc
             x = truth.read("x", frames=frames.tolist(), particles=particles)
             X = truth.X[particles]
         with torch.no_grad():
-            xhat = torch.as_tensor(_at(t, rollout.t, rollout.xhat)).to(at.device, at.dtype)
+            xhat = torch.as_tensor(at_times(t, rollout.t, rollout.xhat)).to(at.device, at.dtype)
             off = at.position(xhat).double().cpu().numpy() - x
         errors = np.sqrt(np.square(off).sum(2).mean(1))
         if rollout.diverged >= 0:
@@ -75,11 +75,6 @@ def _calibration(validating, manifold: Manifold, trust: Trust, rollouts: Sequenc
         signal = np.interp(t, rollout.t, rollout.signal)
         rows.append((errors, moved, signal, np.full(len(t), rms(trust.moved(rollout.xhat)))))
     return Calibration.of(t, *(np.stack(values) for values in zip(*rows, strict=True)))
-
-
-def _at(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Rows [n, q] at times [n], at other times t [F], linear between them."""
-    return np.stack([np.interp(t, times, column) for column in rows.T], axis=1)
 
 
 def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Reach:

@@ -10,7 +10,8 @@ from nsf.errors import ConfigError, StorageError
 from nsf.runs import Run
 from nsf.runs.columns import table
 from nsf.runs.listing import FIELDS, Entry, entries, text
-from nsf.runs.pruning import bytes_text, dependents, older, prunable, remove, size_of
+from nsf.runs.pruning import dependents, older, prunable, remove
+from nsf.storage import bytes_text, size_of
 from nsf.terminal import screen
 
 if TYPE_CHECKING:
@@ -174,7 +175,7 @@ def _delete(going: Sequence[Run], sure: bool) -> int:
     if not going:
         _say(["nothing to delete"])
         return 0
-    sizes = {run: size_of(run) for run in going}
+    sizes = {run: size_of(run.path) for run in going}
     for run, size in sizes.items():
         print(f"{run.id}  {run.status}  {bytes_text(size)}")
     total = f"{len(going)} run{'s' * (len(going) > 1)}, {bytes_text(sum(sizes.values()))}"

@@ -17,7 +17,7 @@ from nsf.results.overview.tables import Column, columns
 from nsf.results.style import FULL, PALETTE, REDUCED, figure, styled
 from nsf.runs import Run
 from nsf.runs.listing import FIELDS, Entry, entries, text
-from nsf.storage import writing
+from nsf.storage import write_text, writing
 
 _CHOSEN = ("stage", "scene", "status")
 
@@ -54,9 +54,7 @@ def write_index(folder: Path, root: Path | None = None) -> Path:
         headings=[column.title for column in shown],
         rows=[_row(entry, shown, folder) for entry in runs],
     )
-    with writing(folder / "index.html") as partial:
-        partial.write_text(page, encoding="utf-8")
-    return folder / "index.html"
+    return write_text(folder / "index.html", page)
 
 
 def _row(entry: Entry, shown: Sequence[Column], folder: Path) -> dict:

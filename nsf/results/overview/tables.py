@@ -14,7 +14,7 @@ from nsf.results.columns import brief, number
 from nsf.runs import Run
 from nsf.runs.columns import CASE, TITLES, differing, scaled, setting, title_of, unit_of
 from nsf.runs.listing import FIELDS, MAIN, ORIGIN, Entry, flat, text
-from nsf.runs.pruning import bytes_text, size_of
+from nsf.storage import bytes_text, size_of
 
 _MOST = 6  # keys that have a column, beside those of `TITLES` and those that are named
 _WIDEST = 28  # characters of a cell of a terminal
@@ -158,7 +158,12 @@ def run_table(run: Run, everything: Sequence[Run]) -> Table:
             table.add_row("" if at else title, escape(key), escape(value))
 
     manifest = entry.manifest
-    state = {"id": run.id, "folder": str(run.path), "status": run.status, "size": bytes_text(size_of(run))}
+    state = {
+        "id": run.id,
+        "folder": str(run.path),
+        "status": run.status,
+        "size": bytes_text(size_of(run.path)),
+    }
     if value := entry.fault or manifest.get("error"):
         state["error"] = text(value)
     if manifest.get("created"):

@@ -21,6 +21,7 @@ from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError
 from nsf.live import demo, publish
 from nsf.live.model import LiveModel, at_surface
+from nsf.storage import write_text
 
 WEB = Path(__file__).parents[1] / "web"
 
@@ -381,7 +382,7 @@ def test_titles_units_and_names_are_text(opened, taught_model, tmp_path, monkeyp
     parameters = tuple(replace(p, unit=hostile) for p in taught_model.parameters)
     monkeypatch.setattr(taught_model, "parameters", parameters)
     title, data = publish.model_data(taught_model)
-    path = publish.page.saved(tmp_path / "page.html", publish.page.html(title, data))
+    path = write_text(tmp_path / "page.html", publish.page.html(title, data))
     assert unescape(re.search(r"<title>([^<]*)</title>", path.read_text())[1]) == hostile
     tab = opened(path)
     assert tab.text_content("#title") == tab.title() == hostile
