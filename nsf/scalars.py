@@ -1,7 +1,9 @@
 """Numbers and texts of a configuration, checked; loads no NumPy, so that a refusal is fast."""
 
 import math
+from collections.abc import Iterable
 from numbers import Real
+from typing import Any
 
 from nsf.errors import ConfigError
 
@@ -61,4 +63,18 @@ def text(key: str, value) -> str:
     """
     if not isinstance(value, str) or not value.strip():
         raise ConfigError(f"{key}={shown(value)} must be text, and not empty")
+    return value
+
+
+def one_of(key: str, value: Any, options: Iterable) -> Any:
+    """A value that is one of several.
+
+    Raises:
+        ConfigError: quotes the key and the value, and names the others.
+    """
+    options = list(options)
+    if not any(value == option and type(value) is type(option) for option in options):
+        *names, last = [str(o).lower() if isinstance(o, bool) else shown(o) for o in options]
+        choices = f"{', '.join(names)} or {last}" if names else last
+        raise ConfigError(f"{key}={shown(value)} is unknown; choose {choices}")
     return value

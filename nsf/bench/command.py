@@ -10,6 +10,7 @@ from nsf.bench.rows import Measurements, Settings
 from nsf.errors import ConfigError
 from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
+from nsf.scalars import one_of
 from nsf.storage import require_folder
 
 BENCHES = ("whole", "full_order", "scaling", "reduced", "batch", "recurrence", "training")
@@ -77,10 +78,7 @@ def _settings(options: Mapping[str, str]) -> Settings:
 
 def _chosen(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
     """Names with commas in between."""
-    names = tuple(text.split(","))
-    if unknown := [name for name in names if name not in known]:
-        raise ConfigError(f"{key}={unknown[0]} is unknown; choose from {', '.join(known)}")
-    return names
+    return tuple(one_of(key, name, known) for name in text.split(","))
 
 
 def _count(text: str) -> int:

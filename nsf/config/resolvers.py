@@ -12,7 +12,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nsf.errors import ConfigError
-from nsf.scalars import number
+from nsf.scalars import number, one_of
 
 #: Resolvers that any key may call.
 ALLOWED = ("scaled", "per", "turned", "oc.select")
@@ -37,9 +37,7 @@ def scaled(table: DictConfig, *, _root_: DictConfig):
     scale = _root_.scale
     if not isinstance(table, dict | DictConfig):
         raise ConfigError(f"${{scaled:{table}}} has no values by scale; give {{small: …, paper: …}}")
-    if scale not in table:
-        raise ConfigError(f"scale={scale} is unknown here; choose one of {', '.join(map(str, table))}")
-    return table[scale]
+    return table[one_of("scale", scale, table)]
 
 
 def per(count) -> float:

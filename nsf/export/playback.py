@@ -28,6 +28,7 @@ from nsf.mpm.device import warp_device
 from nsf.pipeline import Pipeline
 from nsf.progress import Progress
 from nsf.runs import Run
+from nsf.scalars import one_of
 from nsf.scenes import Scene
 from nsf.vectors import drawn
 
@@ -134,8 +135,7 @@ class Playback:
         configuration.number("every", every, least=1, whole=True)
         if points is not None:
             configuration.number("points", points, least=1, whole=True)
-        if color not in QUANTITIES:
-            raise ConfigError(f"color={color} is unknown; choose one of {', '.join(QUANTITIES)}")
+        one_of("color", color, QUANTITIES)
         if not (fps > 0 and math.isfinite(fps)):
             raise ConfigError(f"fps={fps} must be positive and finite")
         self.run, self.color, self.every, self.fps = run, color, every, fps

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nsf.errors import ConfigError
+from nsf.scalars import one_of
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,4 @@ def precision_of(name: str | Precision) -> Precision:
     """
     if isinstance(name, Precision):
         return name
-    if name not in _BY_NAME:
-        raise ConfigError(f"precision={name!r} is unknown; choose one of {', '.join(_BY_NAME)}")
-    return _BY_NAME[name]
+    return _BY_NAME[one_of("precision", name, _BY_NAME)]

@@ -1,6 +1,5 @@
 """Values of a configuration that nothing is built from before the stage that needs them, checked first."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -9,6 +8,7 @@ from nsf import config as configuration
 from nsf.errors import ConfigError
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.models.base import FALLBACKS
+from nsf.scalars import one_of
 
 #: Keys that hold others, none of which is left out.
 _SECTIONS = (
@@ -52,8 +52,7 @@ def check_values(c: DictConfig) -> None:
     name = c.report.name if isinstance(c.report.name, str | int) else ""
     if str(name) in ("", "..") or Path(str(name)).name != str(name):
         raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
-    if c.precision not in PRECISIONS:
-        raise ConfigError(f"precision={c.precision!r} is unknown; choose one of {', '.join(PRECISIONS)}")
+    one_of("precision", c.precision, PRECISIONS)
     _check_paper(c.scene.get("paper"))
 
 
@@ -82,13 +81,6 @@ def check_every(every: int, steps: int) -> None:
         raise ConfigError(
             f"data.every={every} does not divide the {steps} steps of a run; set data.every={near}"
         )
-
-
-def one_of(key: str, value, options: Sequence) -> None:
-    """Raises ConfigError where the value of a key is no option; names them."""
-    if not any(value == option and type(value) is type(option) for option in options):
-        shown = [str(o).lower() if isinstance(o, bool) else "null" if o is None else o for o in options]
-        raise ConfigError(f"{key}={value} is unknown; choose {', '.join(shown[:-1])} or {shown[-1]}")
 
 
 def _check_paper(stated) -> None:

@@ -82,7 +82,7 @@ def test_version(capsys):
 REFUSED = [
     ("run", "latent_dim", ["'latent_dim' is not key=value"]),
     ("run", "--fast", ["'--fast' is not key=value"]),
-    ("run", "scale=big", ["scale=big", "choose one of small, paper"]),
+    ("run", "scale=big", ["scale=big", "choose small or paper"]),
     ("run", "device=gpu", ["device=gpu"]),
     ("run", "deploy.split=foo", ["deploy.split=foo", "test, validation or train"]),
     ("point", "path=pull", ["path='pull'", "simple_shear"]),

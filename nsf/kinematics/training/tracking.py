@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nsf.errors import ConfigError
 from nsf.extras import optional
+from nsf.scalars import one_of
 from nsf.storage import locked, write_text
 
 if TYPE_CHECKING:
@@ -25,11 +25,8 @@ def check_tracking(tracking: str | None) -> None:
         ConfigError: it is unknown.
         MissingExtraError: it is not installed; names the command.
     """
-    if tracking is None:
-        return
-    if tracking not in EXTRAS:
-        raise ConfigError(f"tracking={tracking} is unknown; choose null, {' or '.join(EXTRAS)}")
-    optional(tracking, EXTRAS[tracking])
+    if one_of("tracking", tracking, (None, *EXTRAS)) is not None:
+        optional(tracking, EXTRAS[tracking])
 
 
 def loggers(folder: Path, tracking: str | None) -> list[Logger]:

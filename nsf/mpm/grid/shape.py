@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from nsf.errors import ConfigError
 from nsf.mpm.precision import Precision
+from nsf.scalars import one_of
 
 DEGREES = {"quadratic": 2, "cubic": 3}
 
@@ -56,9 +56,7 @@ def shape_functions(precision: Precision, name: str) -> ShapeFunctions:
     """
     import warp as wp
 
-    if name not in DEGREES:
-        raise ConfigError(f"shape={name!r} is unknown; choose one of {', '.join(DEGREES)}")
-    degree = DEGREES[name]
+    degree = DEGREES[one_of("shape", name, DEGREES)]
     real, vec3 = precision.real, precision.vec3
     stencil = wp.types.matrix(shape=(3, degree + 1), dtype=real)
     offset = stencil_offset(name)

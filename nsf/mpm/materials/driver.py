@@ -9,6 +9,7 @@ from nsf.errors import ConfigError, InstabilityError, ShapeError
 from nsf.mpm.device import warp_device
 from nsf.mpm.materials.base import Material, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
+from nsf.scalars import one_of
 
 
 def drive(
@@ -116,8 +117,7 @@ def deformation_path(name: str, amplitude: float, points: int) -> tuple[np.ndarr
     Raises:
         ConfigError: unknown name, amplitude ≤ 0 (or ≥ 1 for compressions), points < 2.
     """
-    if name not in PATHS:
-        raise ConfigError(f"path={name!r} is unknown; choose one of {', '.join(PATHS)}")
+    one_of("path", name, PATHS)
     if not amplitude > 0 or (name in ("oedometer", "isotropic_compression") and not amplitude < 1):
         raise ConfigError(f"point.amplitude={amplitude} must be positive, and below 1 for compression")
     if points < 2:

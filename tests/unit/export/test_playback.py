@@ -134,7 +134,7 @@ def test_the_run_and_its_training_are_enough(deployed, tmp_path):
         ({"every": 0}, "every=0"),
         ({"fps": 0.0}, "fps=0"),
         ({"fps": float("nan")}, "fps=nan"),
-        ({"color": "red"}, "color=red is unknown; choose one of von_mises, displacement"),
+        ({"color": "red"}, "color=red is unknown; choose von_mises or displacement"),
         (
             {"parameter": 27.0},
             r"27.0 was not deployed; choose one of 26, or .*scene\.design\.test",
