@@ -93,8 +93,8 @@ def _size_keys(scene: Scene, particles: int) -> list[str]:
 def _design_keys(design: Mapping[str, Any]) -> list[str]:
     """Keys of few of the values of a design: one validates, and one is held out."""
     train = list(design.train)
-    some = np.unique(np.linspace(0, len(train) - 1, min(len(train), _TRAINED)).round().astype(int))
-    chosen = {"train": [train[k] for k in some], "validation": design.validation[:1]}
+    some = [train[k] for k in spaced(len(train), _TRAINED)]
+    chosen = {"train": some, "validation": design.validation[:1]}
     chosen["test"] = design.test[:1]
     return [f"scene.design.{split}={list(values)}" for split, values in chosen.items()]
 

@@ -12,7 +12,6 @@ from nsf.dynamics.interop import as_matrices, as_scalars, on_torch_stream
 from nsf.errors import ConfigError
 from nsf.mpm import Precision
 from nsf.mpm.materials import Material, make_elastic_stress
-from nsf.scalars import one_of
 
 STRESS = ("field", "deformation", "particles")
 AFFINE = ("field", "none", "particles")
@@ -45,8 +44,9 @@ class Sources:
     affine: str = "field"
 
     def __post_init__(self):
-        one_of("stress", self.stress, STRESS)
-        one_of("affine", self.affine, AFFINE)
+        for name, options in (("stress", STRESS), ("affine", AFFINE)):
+            if (value := getattr(self, name)) not in options:
+                raise ConfigError(f"{name}={value} is unknown; choose one of {', '.join(options)}")
         if (self.stress == "particles") != (self.affine == "particles"):
             raise ConfigError(
                 f"stress={self.stress} does not go with affine={self.affine}: particles carry both; set "

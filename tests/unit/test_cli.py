@@ -85,7 +85,7 @@ REFUSED = [
     ("run", "scale=big", ["scale=big", "choose small or paper"]),
     ("run", "device=gpu", ["device=gpu"]),
     ("run", "deploy.split=foo", ["deploy.split=foo", "test, validation or train"]),
-    ("point", "path=pull", ["path='pull'", "simple_shear"]),
+    ("point", "path=pull", ["path=pull", "simple_shear"]),
     ("point", "point.amplitude=abc", ["point.amplitude=abc"]),
     ("point", "point.rate=0", ["point.rate=0"]),
 ]

@@ -78,7 +78,7 @@ def test_the_newest_run_is_named(export, deployed):
         (["--vtk", "--points", "many"], ["--points", "many"]),
         (["--vtk", "--every", "0"], ["every=0"]),
         (["--vtk", "--fps", "nan"], ["fps=nan"]),
-        (["--vtk", "--color", "red"], ["color=red", "von_mises, displacement"]),
+        (["--vtk", "--color", "red"], ["color=red", "von_mises or displacement"]),
         (["--vtk", "--parameter", "27"], ["parameter=27", "choose one of 26"]),
         (["--vtk", "--device", "tpu"], ["device=tpu"]),
         (["--vtk", "--output", "/proc/no/such"], ["cannot write /proc/no/such"]),
