@@ -28,9 +28,7 @@ class ColorScale:
         power: of the share of `top` that a colour stands for; below 1 it parts small values.
     """
 
-    def __init__(
-        self, top: float, cmap: str, factor: float, unit: str, title: str = "", power: float = 1.0
-    ):
+    def __init__(self, top: float, cmap: str, factor: float, unit: str, title: str = "", power: float = 1.0):
         self.factor, self.unit, self.top, self.title = factor, unit, top, title
         scale = Normalize(0.0, top / factor) if power == 1.0 else PowerNorm(power, 0.0, top / factor)
         self.mappable = ScalarMappable(scale, matplotlib.colormaps[cmap])
