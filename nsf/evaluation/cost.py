@@ -59,13 +59,19 @@ class SolverCost:
         return asdict(self)
 
 
-def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str, SolverCost]:
+def measure(
+    subjects: dict[str, Subject],
+    trials: int,
+    device: str,
+    advance: Callable[[], object] = lambda: None,
+) -> dict[str, SolverCost]:
     """Whole runs of every solver, turn by turn, so that a machine that slows down slows all of them.
 
     Args:
         subjects: by name.
         trials: runs of each.
         device: `cpu`, `cuda` or `cuda:N`.
+        advance: called after each run; of each solver there is one more, in which stages are timed.
     """
     memory: dict[str, tuple] = {}
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in subjects}
@@ -76,6 +82,7 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
             else:
                 taken = _times(subject.build(), subject.steps, device)
             times[name].append(taken)
+            advance()
     costs = {}
     for name, subject in subjects.items():
         steps, totals = np.array(times[name]).T
@@ -91,6 +98,7 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
             trials=trials,
             steps=subjects[name].steps,
         )
+        advance()
     return costs
 
 

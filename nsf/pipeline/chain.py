@@ -24,6 +24,7 @@ from nsf.models.drawn import Drawn
 from nsf.paths import option
 from nsf.pipeline import naming
 from nsf.pipeline.configured import Configured
+from nsf.pipeline.durations import measured
 from nsf.progress import START, timed
 from nsf.results.folder import check_place
 from nsf.results.question import Question, unchanged
@@ -210,20 +211,19 @@ class Pipeline(Configured):
     superresolution = property(naming.superresolution)
 
     def runs_of(self, stage: str) -> list[Run]:
-        """The runs of a stage, each once; none of `teach` where nothing is taught."""
+        """The runs of a stage, each once; none of `encode` and `teach` where nothing is taught."""
         if stage == "simulate":
             return list(dict.fromkeys(self.simulation(*needed) for needed in self.needed()))
         names = {
             "train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation",
-            "superresolve": "superresolution",
+            "superresolve": "superresolution", "encode": "encoding",
         }  # fmt: skip
-        return [] if stage == "teach" and not self.is_taught else [getattr(self, names[stage])]
+        return [] if stage in ("encode", "teach") and not self.is_taught else [getattr(self, names[stage])]
 
     @property
     def inputs(self) -> list[Run]:
         """The runs from which the chain makes others: trajectories, the manifold, encoded runs, a fit."""
-        runs = [run for stage in ("simulate", "train", "teach") for run in self.runs_of(stage)]
-        return [*runs, self.encoding] if self.is_taught else runs
+        return [run for stage in ("simulate", "train", "encode", "teach") for run in self.runs_of(stage)]
 
     def evaluated(self, stage: str = "evaluate") -> Run:
         """The complete run of a stage, of this device or another: it may have been brought here.
@@ -317,7 +317,8 @@ class Pipeline(Configured):
                 from nsf.pipeline.stages.simulation import simulate_missing
 
             self.check()
-            simulate_missing(self, missing, warned)
+            with measured(self, "simulate"):
+                simulate_missing(self, missing, warned)
         return runs
 
     def full_order(self, cases: Sequence[Case]) -> list[Run]:
@@ -378,7 +379,8 @@ class Pipeline(Configured):
             return page
         from nsf.results.report import build_report
 
-        page = build_report(runs, self.report_folder, self._question, first=self.evaluation)
+        with measured(self, "report"):
+            page = build_report(runs, self.report_folder, self._question, first=self.evaluation)
         self.say(f"{said} → {page}")
         return page
 
@@ -407,7 +409,8 @@ class Pipeline(Configured):
                     module, _, function = work.partition(".")
                     with timed(START):
                         make = getattr(import_module(f"nsf.pipeline.stages.{module}"), function)
-                    make(self, run)
+                    with measured(self, run.stage):
+                        make(self, run)
                     return run
         self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
         return run

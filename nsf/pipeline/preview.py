@@ -11,37 +11,34 @@ from rich.table import Table
 
 from nsf import config as configuration
 from nsf.pipeline.chain import Pipeline
+from nsf.pipeline.durations import STAGES, START, Interval, crowding, due, interval, times, work_of
 from nsf.runs import Run
 from nsf.storage import bytes_text
 
-STAGES = ("simulate", "train", "teach", "deploy", "evaluate")
-#: Key whose value runs of a stage must share for their times to be compared.
-_ALIKE = {"train": "field", "deploy": "model"}
 
-
-@dataclass
-class Expected:
-    """Time and space of the runs of a stage that are to be made.
+@dataclass(frozen=True)
+class Stage:
+    """A stage of some jobs before their work.
 
     Attributes:
-        runs: how many there are in all; made: how many are there already.
-        seconds, size: of those that are to be made [s, byte]; NaN where nothing like them was ever made.
-        samples: how many runs that rests on; like: which.
+        name: of the stage.
+        runs: that it has, each once; missing: how many are to be made.
+        time: of these [s]; size: bytes of their files, 0.0 where no like run was ever made.
     """
 
-    runs: int
-    made: int
-    seconds: float = math.nan
-    size: float = math.nan
-    samples: int = 0
-    like: str = ""
+    name: str
+    runs: tuple[Run, ...]
+    missing: int
+    time: Interval
+    size: float = 0.0
 
     @property
     def state(self) -> str:
         """As a reader sees it."""
-        if self.made == self.runs:
-            return "there" if self.runs == 1 else f"all {self.runs} there"
-        return "to be made" if self.runs == 1 else f"{self.runs - self.made} of {self.runs} to be made"
+        count = len(self.runs) or 1  # a page is no run
+        if not self.missing:
+            return "there" if count == 1 else f"all {count} there"
+        return "to be made" if count == 1 else f"{self.missing} of {count} to be made"
 
 
 def plans(jobs: Sequence[Sequence[str]]) -> list[Pipeline]:
@@ -65,57 +62,55 @@ def stages_table(pipelines: Sequence[Pipeline]) -> Table:
     """State, expected time and room of every stage of some jobs, whose common runs count once."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     if len(pipelines) > 1:
-        table.caption = f"{len(pipelines)} jobs; runs that they share are made once"
+        table.caption = f"{len(pipelines)} jobs, one after the other; runs that they share are made once"
         table.caption_justify = "left"
     for heading, side in (
         ("stage", "left"), ("state", "left"), ("run", "left"), ("time", "right"), ("disk", "right"),
-        ("as in", "left"),
+        ("measured", "left"),
     ):  # fmt: skip
         table.add_column(heading, justify=side, no_wrap=heading == "run")
-    seconds, size = 0.0, 0.0
-    for stage in STAGES:
-        runs = {run: pipeline for pipeline in pipelines for run in pipeline.runs_of(stage)}
-        if not runs:
-            continue
-        estimate = expected(stage, runs)
-        if estimate.made < estimate.runs:
-            seconds, size = seconds + estimate.seconds, size + estimate.size
-        only = next(iter(runs)).hash if len(runs) == 1 else ""
+    stages = stages_of(pipelines)
+    for stage in stages:
+        only = stage.runs[0].hash if len(stage.runs) == 1 else ""
         cost = ["", "", ""]
-        if estimate.made < estimate.runs:
-            none = "nothing like it was made here"
-            like = f"{estimate.samples} {estimate.like}" if estimate.samples else none
-            cost = [_time(estimate.seconds), _size(estimate.size), like]
-        table.add_row(stage, estimate.state, only, *map(escape, cost))
-    if seconds:
-        table.add_row("in all", "", "", _time(seconds), _size(size), "")
+        if stage.missing:
+            size = bytes_text(stage.size) if stage.size else ""
+            cost = [_span(stage.time), size, stage.time.like or "nothing like it: a guess"]
+        table.add_row(stage.name, stage.state, only, *map(escape, cost))
+    if due := [stage for stage in stages if stage.missing]:
+        low, high = (sum(getattr(stage.time, end) for stage in due) for end in ("low", "high"))
+        span = Interval(low + START / 2, high + 2 * START * crowding())
+        table.add_row("in all", "", "", _span(span), bytes_text(sum(stage.size for stage in due)), "")
     return table
 
 
-def expected(stage: str, runs: dict[Run, Pipeline]) -> Expected:
-    """Time and space of runs of a stage, by those of its kind that are there, at best of the same scene."""
-    missing = {run: pipeline for run, pipeline in runs.items() if not run.complete}
-    estimate = Expected(len(runs), len(runs) - len(missing))
-    if not missing:
-        return estimate
-    there = [run for run in Run.find(stage, root=next(iter(runs)).root) if run.complete]
-    seconds, size = 0.0, 0.0
-    for run, pipeline in missing.items():
-        alike = [r for r in there if r.manifest.get("device") == pipeline.device and _kind(r) == _kind(run)]
-        near = [r for r in alike if r.scene == run.scene] or alike
-        estimate.samples = len(near)
-        of = run.scene if near and near[0].scene == run.scene else "other scenes"
-        estimate.like = f"run{'s' * (len(near) > 1)} of {of}"
-        if stage == "simulate":
-            stored = trajectory_bytes(pipeline)
-            rates = [r.manifest["seconds"] / _bytes(r) for r in near if _bytes(r)]
-            seconds += statistics.median(rates) * stored if rates else math.nan
-            size += stored
-        else:
-            seconds += statistics.median(r.manifest["seconds"] for r in near) if near else math.nan
-            size += statistics.median(map(_bytes, near)) if near else math.nan
-    estimate.seconds, estimate.size = seconds, size
-    return estimate
+def stages_of(pipelines: Sequence[Pipeline]) -> list[Stage]:
+    """The stages that some jobs have, in order."""
+    done, stages = times(pipelines[0].training.root), []
+    for name in STAGES:
+        runs = [] if name == "report" else [run for one in pipelines for run in one.runs_of(name)]
+        runs = tuple(dict.fromkeys(runs))
+        if not runs and name != "report":
+            continue
+        chains = [*pipelines, *(more for one in pipelines for more in one.calibrating if name == "deploy")]
+        work, sizes = {}, {}
+        for one in chains:
+            work |= (expected := due(one, name))
+            sizes |= dict.fromkeys(expected, _size(one, name))
+        missing = sum(not run.complete for run in runs) if runs else len(work)
+        time = interval(work_of(pipelines[0], name, work.values()), done) if work else Interval(0, 0)
+        stages.append(Stage(name, runs, missing, time, sum(sizes.values())))
+    return stages
+
+
+def _size(pipeline: Pipeline, stage: str) -> float:
+    """Bytes of a run of a stage: of a trajectory, or those of earlier runs of the scene."""
+    if stage == "simulate":
+        return trajectory_bytes(pipeline)
+    if stage == "report":
+        return 0.0
+    there = [run for run in Run.find(stage, pipeline.scene.name, pipeline.training.root) if run.complete]
+    return statistics.median(map(_bytes, there)) if there else 0.0
 
 
 def scene_table(pipeline: Pipeline) -> Table:
@@ -190,23 +185,15 @@ def _memory(pipeline: Pipeline) -> str:
     return f"{bytes_text(solver)} of a full-order run; {data} of {frames:,} training frames{kept}"
 
 
-def _kind(run: Run) -> str:
-    """Values that runs of a stage share whose times can be compared."""
-    value = run.config.get(_ALIKE.get(run.stage, ""))
-    return str(value.get("_target_") if isinstance(value, dict) else value)
-
-
 def _bytes(run: Run) -> int:
     return sum(output["bytes"] for output in run.manifest.get("outputs", ()))
 
 
-def _time(seconds: float) -> str:
-    if math.isnan(seconds):
-        return "unknown"
-    if seconds >= 5400:
-        return f"{seconds / 3600:.1f} h"
-    return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
-
-
-def _size(size: float) -> str:
-    return "unknown" if math.isnan(size) else bytes_text(size)
+def _span(time: Interval) -> str:
+    """Both ends of an interval in the unit of the upper one, outwards to two figures."""
+    unit, name = next(
+        (u, n) for u, n in ((3600, "h"), (60, "min"), (1, "s")) if time.high >= 1.5 * u or u == 1
+    )
+    low, high = time.low / unit, time.high / unit
+    digit = 1 if high < 10 and unit > 1 else 0
+    return f"{math.floor(low * 10**digit) / 10**digit:g}–{math.ceil(high * 10**digit) / 10**digit:g} {name}"

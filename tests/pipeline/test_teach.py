@@ -15,15 +15,26 @@ import nsf
 from nsf.deployment import TRUST, Rollout, Trust, rollouts
 from nsf.dynamics.integration import NeighbourSearch
 from nsf.errors import ConfigError, InstabilityError, MissingRunError
-from nsf.pipeline import Pipeline
+from nsf.pipeline import Pipeline, preview
+from nsf.pipeline.durations import times
 from nsf.pipeline.stages import encoding
+from nsf.progress import Progress
 from nsf.recurrence import RecurrenceEngine
 
 ANGLE = {"friction_angle": 26.0}
 
 
 @pytest.fixture(scope="module")
-def lesson(taught_root, pipeline_at, tmp_path_factory):
+def bars():
+    """Bars that have ended, each with its stage, what was done, and its total."""
+    ended = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Progress, "__exit__", lambda bar, *_: ended.append((bar._stage, bar._done, bar._total)))
+        yield ended
+
+
+@pytest.fixture(scope="module")
+def lesson(taught_root, bars, pipeline_at, tmp_path_factory):
     """The tiny chain by a recurrence, and what it said."""
     root, said = shutil.copytree(taught_root, tmp_path_factory.mktemp("taught") / "runs"), []
     pipeline = pipeline_at(root, *TAUGHT, say=said.append)
@@ -54,6 +65,29 @@ def reduced(lesson, taught):
 
 
 # -- the stage ------------------------------------------------------------------------------------------
+
+
+def test_bars_end_at_their_totals(lesson, bars):
+    assert [stage for stage, *_ in bars[:3]] == ["deploy", "evaluate", "evaluate: timings"]
+    assert all(done == total > 0 for _, done, total in bars)
+
+
+def test_a_plan_holds_times_of_like_work(lesson, pipeline_at):
+    pipeline, _ = lesson
+    measured = times(pipeline.root)
+    assert {work.stage for work, _ in measured} >= {"teach", "deploy", "evaluate"}
+    longer = pipeline_at(pipeline.root, *TAUGHT, "model.descents=181")
+    stages = {stage.name: stage for stage in preview.stages_of([longer])}
+    assert [name for name, stage in stages.items() if stage.missing] == [
+        "teach",
+        "deploy",
+        "evaluate",
+        "report",
+    ]
+    seconds = {work.stage: seconds for work, seconds in measured}
+    for name in ("teach", "deploy", "evaluate"):
+        assert 0 < stages[name].time.low < seconds[name] < stages[name].time.high
+        assert stages[name].time.like == "1 time"
 
 
 def test_the_chain(lesson):
@@ -89,7 +123,7 @@ def test_no_held_out_value_is_a_lesson(pipeline_at, tmp_path):
     assert held_back.taught.hash != pipeline.taught.hash
 
 
-def test_runs_of_a_teaching_that_was_broken_off_are_taken_up(lesson, copied, pipeline_at, monkeypatch):
+def test_runs_of_a_teaching_that_was_broken_off_are_taken_up(lesson, bars, copied, pipeline_at, monkeypatch):
     pipeline, _ = lesson
     root = copied("simulate", "train")
     streamed, made = encoding.streamed, []
@@ -110,6 +144,7 @@ def test_runs_of_a_teaching_that_was_broken_off_are_taken_up(lesson, copied, pip
         path.write_bytes(data)
     made[:] = [1] * 6
     again = encoded(pipeline_at(root, *TAUGHT, say=said.append))
+    assert bars[-1] == ("encode", 11 * 24, 11 * 24)
     assert len(made) == 10  # three of eight runs were left, and one was damaged
     assert all(any(str(path) in line for line in said) for path in damaged)
     same_runs(again, pipeline.encoding)

@@ -1,6 +1,7 @@
 """`nsf plan`: what a run would do, said before any work; and what a run says while it works."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -11,6 +12,7 @@ from nsf import progress
 from nsf.cli import main
 from nsf.config import load
 from nsf.pipeline import Pipeline, preview
+from nsf.pipeline.durations import FILE, Work, interval, times
 from nsf.pipeline.outcome import outcome
 from nsf.progress import Progress, label, labelled
 from nsf.scenes.resolution import resolution_warnings
@@ -47,7 +49,6 @@ def test_a_chain_that_is_there(nsf, chain):
         "deploy": "there",
         "evaluate": "there",
     }
-    assert "in all" not in out
     assert re.search(r"particles +500\b", out)
     assert re.search(r"memory +\S+ MiB of a full-order run; 2.57 MiB of 75 training frames", out)
     assert re.search(r"Δt = 0.005 s; up to 0.00\d+ s is stable", out)
@@ -65,8 +66,8 @@ def test_what_is_to_be_made_is_expected_to_take_what_the_like_of_it_took(nsf, ch
         "deploy": "to be made",
         "evaluate": "to be made",
     }
-    assert "run of sand" in out
-    assert re.search(r"^in all +\d+ s", out, re.M)
+    assert "1 time" in out
+    assert re.search(r"^in all +[\d.]+–[\d.]+ (s|min)", out, re.M)
     assert {path for path in chain.root.rglob("*")} == before
 
 
@@ -87,20 +88,38 @@ def test_trajectories_take_what_their_bytes_say(chain, tiny, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(chain.root))
     words = [word for word in tiny if not word.startswith("scene.design.train")]
     (names,) = preview.plans([(*words, "scene.design.train=[21,25,35]")])
-    told = preview.expected("simulate", {run: names for run in names.runs_of("simulate")})
+    stages = {stage.name: stage for stage in preview.stages_of([names])}
+    simulate = stages["simulate"]
     of_one = chain.trajectory(26.0).stat().st_size
-    assert (told.runs, told.made) == (4, 1)
-    assert told.size == pytest.approx(3 * of_one, rel=0.2)
-    assert told.seconds > 0
+    assert (len(simulate.runs), simulate.missing) == (4, 3)
+    assert simulate.size == pytest.approx(3 * of_one, rel=0.2)
+    assert 0 < simulate.time.low < simulate.time.high
 
 
-def test_a_stage_like_none_before_is_unknown(nsf, tmp_path, monkeypatch):
+def test_a_stage_like_none_before_is_a_guess(nsf, tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path / "none"))
     _, out, _ = nsf("run", "--dry-run")
     assert states(out)["simulate"] == "4 of 4 to be made"
-    assert "unknown" in out
-    assert "nothing like it was made here" in out
+    assert re.search(r"^simulate .+–.+ nothing like it: a guess$", out, re.M)
+    assert re.search(r"^report +to be made", out, re.M)
     assert not (tmp_path / "none").exists()
+
+
+def test_an_interval_is_narrow_where_like_work_was_measured_often(tmp_path):
+    work = Work("train", "sand", "BasisField", "cpu", 10.0)
+    guess = interval(work, [])
+    often = interval(work, [(work, 30.0)] * 8)
+    other = interval(work, [(replace(work, scene="cake"), 30.0)] * 8)
+    assert guess.low < 10.0 < guess.high
+    assert often.like == "8 times"
+    assert often.low < 30.0 < often.high < 2.0 * 30.0
+    assert other.like == "8 times, other scenes"
+    assert other.low < often.low < often.high < other.high
+    assert interval(work, [(replace(work, device="cuda:0"), 30.0)]) == guess
+    (tmp_path / FILE).write_text(
+        "train,sand,BasisField,cpu,10,30\nno line,\ntrain,sand,BasisField,cpu,0,nan\n"
+    )
+    assert times(tmp_path) == [(work, 30.0)]
 
 
 def test_several_jobs_share_their_runs(nsf):

@@ -152,7 +152,7 @@ def _encoded(pipeline, encoder: Encoder, lessons: Sequence[Lesson], record: Reco
     paths = [record.path / _file(index) for index in range(len(lessons))]
     steps, training = pipeline.scene.steps, pipeline.split.train
     each_step = pipeline.config.data.every == 1  # is stored
-    with Progress("teach: full-order runs", len(lessons) * steps, "steps") as progress:
+    with Progress("encode", len(lessons) * steps, "steps") as progress:
         missing = []
         for lesson, path in zip(lessons, paths, strict=True):
             stored = pipeline.simulation(lesson.case)

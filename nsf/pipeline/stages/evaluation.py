@@ -182,6 +182,7 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
         beside[PROJECTED] = Subject(lambda: pipeline.solver_at(manifold, case, engine=engine), steps)
     coarse = coarse_subjects(scene, case, factors, c.precision, pipeline.device)
     subjects = {"full_order": full, "reduced": reduced, **beside, **coarse}
-    measured = measure(subjects, c.evaluation.trials, pipeline.device)
+    with Progress("evaluate: timings", len(subjects) * (c.evaluation.trials + 1), "runs") as progress:
+        measured = measure(subjects, c.evaluation.trials, pipeline.device, progress.advance)
     decoding = decoding_ms(pipeline.solver_at(manifold, case), rollouts[0], c.evaluation.trials)
     return results.costs(measured, decoding)
