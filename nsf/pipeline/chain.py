@@ -25,6 +25,7 @@ from nsf.paths import option
 from nsf.pipeline import naming
 from nsf.pipeline.configured import Configured
 from nsf.pipeline.durations import measured
+from nsf.pipeline.tracking import Tracked
 from nsf.progress import START, timed
 from nsf.results.folder import check_place
 from nsf.results.question import Question, unchanged
@@ -60,6 +61,8 @@ class Pipeline(Configured):
         DeviceError: the device does not exist.
     """
 
+    #: Name of the sweep that the chain is a job of; empty for none.
+    group = ""
     #: The engine of projected steps: the compiled one where it can, else the reference.
     projecting = "auto"
 
@@ -108,6 +111,11 @@ class Pipeline(Configured):
 
         check(self)
         return self
+
+    @cached_property
+    def tracked(self) -> Tracked:
+        """The chain as a tracked run."""
+        return Tracked(self)
 
     # -- models and cases --------------------------------------------------------------------------------
 

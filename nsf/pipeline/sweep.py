@@ -19,6 +19,7 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from nsf import config as configuration
+from nsf.canonical import content_hash
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
@@ -44,8 +45,14 @@ class Failure:
         return f"{' '.join(self.job) or 'the one job'}: {self.error}"
 
 
-def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object] = print):
+def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object] = print, group: str = ""):
     """Stages of one configuration; gives the result of the last one.
+
+    Args:
+        config: of the chain.
+        stages: names, in order.
+        say: called with a line for the user.
+        group: name of the sweep that they are a job of, for `tracking`.
 
     Raises:
         NSFError: of every kind that a stage raises.
@@ -60,8 +67,9 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         _ = pipeline.held_out  # refused before hours of simulation and training, not after
     if "report" in stages:
         pipeline.check_report_folder()
+    pipeline.group = group
     needs_others = len(stages) > 1 and not pipeline.complete(stages)
-    with reserving(pipeline.inputs if needs_others else ()):
+    with pipeline.tracked, reserving(pipeline.inputs if needs_others else ()):
         for at, name in enumerate(stages):
             with timed(name):
                 result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
@@ -118,13 +126,14 @@ def sweep(
         configuration.check_sweep(overrides, config_name, check)
     jobs = configuration.jobs(sweeps, config_name)
     common = set.intersection(*map(set, jobs))
+    group = f"sweep-{content_hash(list(map(list, jobs)))}" if len(jobs) > 1 else ""
     gpus = visible_gpus() if "joblib" in plugin and all(movable) else ()
-    start = partial(_in_turn, stages, config_name)
+    start = partial(_in_turn, stages, group, config_name)
     if launching:
         # Jobs side by side write into one terminal, or one log.
         apart = "joblib" in plugin or "submitit" in plugin
         labels = tuple(" ".join(o for o in job if o not in common) for job in jobs) if apart else ()
-        task = partial(_job, stages=tuple(stages), labels=labels)
+        task = partial(_job, stages=tuple(stages), labels=labels, group=group)
         start = partial(_launched, _launcher(launching, task, gpus), say)
     dropped = kept == {"held_out"} and {"train", "evaluate"} <= set(stages)
     errors: list[str | None] = []
@@ -216,32 +225,37 @@ def _see_one_gpu(gpus: tuple[str, ...]) -> None:
     os.environ["CUDA_VISIBLE_DEVICES"] = gpus[HydraConfig.get().job.num % len(gpus)]
 
 
-def _job(config: DictConfig, stages: Sequence[str], labels: Sequence[str] = ()) -> str | None:
+def _job(
+    config: DictConfig, stages: Sequence[str], labels: Sequence[str] = (), group: str = ""
+) -> str | None:
     """The error of one job that Hydra launched, in a process of its own or not, as `_ended` has it.
 
     Args:
         config: of the job.
         stages: as of `work`.
         labels: by the number of a job, what each of its lines begins with; none where jobs come one by one.
+        group: name of the sweep.
     """
     guard()  # in a process of its own as well
     hydra = HydraConfig.get()
     with labelled(labels[hydra.job.num] if labels else ""):
-        return _ended(hydra.overrides.task, lambda: configuration.checked(config), stages)
+        return _ended(hydra.overrides.task, lambda: configuration.checked(config), stages, group)
 
 
 def _in_turn(
-    stages: Sequence[str], config_name: str, jobs: Sequence[list[str]], _first: int
+    stages: Sequence[str], group: str, config_name: str, jobs: Sequence[list[str]], _first: int
 ) -> list[str | None]:
     """The error of each job, done in this process one after the other."""
-    return [_ended(job, partial(configuration.load, job, config_name), stages) for job in jobs]
+    return [_ended(job, partial(configuration.load, job, config_name), stages, group) for job in jobs]
 
 
-def _ended(job: Sequence[str], compose: Callable[[], DictConfig], stages: Sequence[str]) -> str | None:
+def _ended(
+    job: Sequence[str], compose: Callable[[], DictConfig], stages: Sequence[str], group: str
+) -> str | None:
     """The error of a job, None where it ended well; as text, which every process can read."""
     _say(f"--- {' '.join(job)}")
     try:
-        work(compose(), stages, _say)
+        work(compose(), stages, _say, group)
     except NSFError as error:
         print(f"{label()}error: {error}", file=sys.stderr, flush=True)
         return str(error)

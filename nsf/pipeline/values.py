@@ -6,8 +6,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.errors import ConfigError
-from nsf.kinematics.training.tracking import check_tracking
 from nsf.models.base import FALLBACKS
+from nsf.pipeline.tracking import TRACKING, check_tracking
 from nsf.scalars import one_of
 
 #: Keys that hold others, none of which is left out.
@@ -44,6 +44,8 @@ def check_values(c: DictConfig) -> None:
     configuration.number("data.every", c.data.every, least=1, whole=True)
     one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
     one_of("fallback", c.fallback, FALLBACKS)
+    if c.tracking is not None:  # as in configurations of earlier runs
+        one_of("tracking", c.tracking, TRACKING)
     check_tracking(c.tracking)
     one_of("data.resident", c.data.resident, (True, False, "auto"))
     one_of("data.keep", c.data.keep, ("all", "held_out"))

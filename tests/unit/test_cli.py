@@ -203,7 +203,7 @@ BEFORE_ANY_WORK = [
     ("evaluation.picture_particles=0", ["evaluation.picture_particles=0"]),
     ("report.name=../elsewhere", ["report.name=../elsewhere", "report.folder"]),
     ("report.folder=/proc/reports", ["no report can be written to /proc/reports", "set report.folder"]),
-    ("tracking=wandb", ["tracking=wandb", "tensorboard"]),
+    ("tracking=sacred", ["tracking=sacred", "tensorboard"]),
 ]
 
 

@@ -24,7 +24,6 @@ from nsf.errors import InstabilityError
 from nsf.gpu import tf32, without_collection
 from nsf.kinematics.training.phases import CHECKPOINT, PHASES, Fit, seed_of
 from nsf.kinematics.training.schedules import Trainer, muon_and_adam
-from nsf.kinematics.training.tracking import loggers
 from nsf.progress import Progress, quiet_lightning
 
 # Steps of a block: enough to hide what Lightning does between two, and about 40 checkpoints a phase.
@@ -39,7 +38,7 @@ def descend(
     snapshots: Snapshots,
     seed: int,
     folder: Path,
-    tracking: str | None,
+    loggers: Callable[[Path], Sequence[Any]],
     say: Callable[[str], object],
 ) -> dict[str, Any]:
     """Train one phase, from the checkpoint in `folder` if there is one, and it is whole.
@@ -50,7 +49,7 @@ def descend(
         snapshots: of the training cases, on that device.
         seed: of batches and noise.
         folder: of the phase.
-        tracking, say: as for `train`.
+        loggers, say: as for `train`.
 
     Returns:
         `state` of the network on the host; `steps`; `loss`, the mean of the last block; and `seconds` that
@@ -67,7 +66,7 @@ def descend(
             "max_epochs": len(data.blocks),
             "plugins": _InItsFolder(),
             "callbacks": [StepProgress(progress), BlockCheckpoint(checkpoint)],
-            "logger": loggers(folder, tracking),
+            "logger": list(loggers(folder)),
             "log_every_n_steps": 1,
         }
         with trainer_on(snapshots.X.device, **options) as trainer:
@@ -216,7 +215,8 @@ class FieldTraining(pl.LightningModule):
             )
         rate, speed = self.rate_at(last - 1), (last - first) / seconds
         # Lightning takes `step` for the place on the axis.
-        self.log_dict({"loss": self.loss, "learning_rate": rate, "steps_per_second": speed, "step": last})
+        values = {"loss": self.loss, "learning_rate": rate, "steps_per_second": speed}
+        self.log_dict({f"{self.phase.name}/{name}": value for name, value in values.items()} | {"step": last})
 
     def take(self, first: int, last: int) -> float:
         """Take the steps first, ..., last − 1; returns their mean loss."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,7 +17,6 @@ from nsf.data.archives import keep, kept, taken_up
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.phases import CHECKPOINT, Fit, seeded
 from nsf.kinematics.training.schedules import Trainer
-from nsf.kinematics.training.tracking import check_tracking
 from nsf.scalars import number
 from nsf.storage import refusals
 
@@ -47,7 +46,7 @@ def train(
     seed: int,
     folder: Path,
     device: str | torch.device,
-    tracking: str | None = None,
+    loggers: Callable[[Path], Sequence[Any]] = lambda folder: (),
     say: Callable[[str], object] = print,
 ) -> tuple[Manifold, dict[str, float]]:
     """Train encoder and fields on the snapshots.
@@ -62,7 +61,7 @@ def train(
         seed: of the initial weights, batches and noise.
         folder: keeps logs, checkpoints and finished phases; one training a folder.
         device: "cpu", "cuda", "cuda:1".
-        tracking: "tensorboard" or "mlflow" for a live page beside the CSV logs.
+        loggers: the loggers of Lightning for a phase, whose folder they are called with.
         say: called with a line for each file of an interrupted training that was damaged, whose part is done
             again.
 
@@ -74,7 +73,6 @@ def train(
 
     Raises:
         ConfigError: a value is out of range.
-        MissingExtraError: what tracks is not installed.
         InstabilityError: a loss is not finite.
         SchemaError: somebody made the files of an interrupted training.
         StorageError: the disk refused a file.
@@ -83,7 +81,6 @@ def train(
     Source: Zong et al. 2023, section 4.5.
     """
     number("latent_dim", latent_dim, 1, whole=True)
-    check_tracking(tracking)
     device, folder = torch.device(device), Path(folder)
     resumed = any(folder.rglob("*.pt"))
     fits = taken_up(folder, "train") if resumed else contextlib.nullcontext()
@@ -97,7 +94,7 @@ def train(
         total = begun["seconds"] + _once(folder / "built.pt", say, lambda: built["seconds"])
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
-            phase = partial(_descend, fit, trainer, snapshots, seed, folder / fit.name, tracking, say)
+            phase = partial(_descend, fit, trainer, snapshots, seed, folder / fit.name, loggers, say)
             outcome = _once(folder / f"{fit.name}.pt", say, phase)
             fit.network.load_state_dict(outcome["state"])
             fit.network.to(device)  # Lightning leaves it on the host

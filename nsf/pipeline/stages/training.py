@@ -21,7 +21,15 @@ def train(pipeline, run: Run) -> None:
     with run.record(device=device, seed=c.seed) as record:
         with contextlib.closing(Snapshots(paths, device, c.data.resident)) as snapshots:
             manifold, metrics = train_field(
-                snapshots, field, trainer, c.latent_dim, c.seed, run.path, device, c.tracking, pipeline.say
+                snapshots,
+                field,
+                trainer,
+                c.latent_dim,
+                c.seed,
+                run.path,
+                device,
+                pipeline.tracked.loggers,
+                pipeline.say,
             )
         manifold.save(run.path / "manifold.pt")
         record.output("manifold.pt")

@@ -112,9 +112,9 @@ def _trained(ax: Axes, run: Run) -> None:
         phases.setdefault(log.parents[2].name, []).append(log)
     if not phases:
         raise ValueError("no log")
-    for color, logs in zip(PALETTE, phases.values(), strict=False):
+    for color, (phase, logs) in zip(PALETTE, phases.items(), strict=False):
         loss = pd.concat(map(pd.read_csv, logs)).sort_values("step")
-        ax.semilogy(loss["step"], loss["loss"], color=color, linewidth=1)
+        ax.semilogy(loss["step"], loss[f"{phase}/loss"], color=color, linewidth=1)
 
 
 def _deployed(ax: Axes, run: Run) -> None:

@@ -1,14 +1,13 @@
 """Schedules, resumption to the bit, and what training refuses."""
 
 import signal
-import sys
 import time
 
 import pytest
 import torch
 
 from nsf.data import archives
-from nsf.errors import ConfigError, InstabilityError, MissingExtraError, SchemaError
+from nsf.errors import ConfigError, InstabilityError, SchemaError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.training import lightning
@@ -31,9 +30,9 @@ def short_blocks():
 
 @pytest.fixture(scope="module")
 def train(snapshots, fields):
-    def run(field, folder, schedule=SHORT, seed=0, tracking=None, say=print):
+    def run(field, folder, schedule=SHORT, seed=0, say=print):
         fit = fields[field]
-        return training.train(snapshots, fit, schedule, LATENT, seed, folder, "cpu", tracking, say)
+        return training.train(snapshots, fit, schedule, LATENT, seed, folder, "cpu", say=say)
 
     return run
 
@@ -239,7 +238,7 @@ def test_heads_follow_strong_coordinates_and_ignore_those_below_the_floor(snapsh
     schedule = FastTrainer(steps=250, learning_rate=1e-2)
     for floor in (0.0, 0.2):
         field = BasisField(modes=[9, 7, 8], beta=4, depth=2, noise_floor=floor)
-        manifold, _ = training.train(snapshots, field, schedule, r, 0, tmp_path / str(floor), "cpu", None)
+        manifold, _ = training.train(snapshots, field, schedule, r, 0, tmp_path / str(floor), "cpu")
         sigma = manifold.fields["deformation"].leading
         torch.testing.assert_close(manifold.spread, (1 + (floor * sigma[0] / sigma) ** 2).sqrt())
         near = manifold.training_latents[5] + torch.eye(r).double()
@@ -272,36 +271,3 @@ def test_heads_follow_strong_coordinates_and_ignore_those_below_the_floor(snapsh
 def test_values_are_checked(make, message):
     with pytest.raises(ConfigError, match=message.replace("[", r"\[")):
         make()
-
-
-def test_tensorboard(train, tmp_path):
-    train("basis", tmp_path, tracking="tensorboard")
-    assert list(tmp_path.glob("stress/tensorboard/*/events*"))
-    assert (tmp_path / "stress/csv/0/metrics.csv").read_text().count("\n") == 4
-    with pytest.raises(ConfigError, match="tracking=wandb"):
-        train("basis", tmp_path, tracking="wandb")
-
-
-def test_mlflow_keeps_the_losses_in_sqlite(train, tmp_path, monkeypatch):
-    mlflow = pytest.importorskip("mlflow", reason="mlflow is not installed; pip install 'nsf[mlflow]'")
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    monkeypatch.chdir(tmp_path)
-    folder = tmp_path / "train" / "sand" / "0123"
-    train("basis", folder, tracking="mlflow")
-    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/train/sand/mlflow.db")
-    (experiment,) = (e for e in client.search_experiments() if e.name == "train/sand")
-    runs = client.search_runs([experiment.experiment_id])
-    assert {run.info.run_name for run in runs} == {f"0123/{phase}" for phase in PHASES}
-    (stress,) = (run for run in runs if run.info.run_name == "0123/stress")
-    history = client.get_metric_history(stress.info.run_id, "loss")
-    assert [point.step for point in history] == [5, 10, 12]
-    assert stress.info.status == "FINISHED"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["train"]  # nothing beside it, as ./mlruns
-
-
-@pytest.mark.parametrize("tracking", ["tensorboard", "mlflow"])
-def test_tracking_that_is_not_installed(train, tmp_path, monkeypatch, tracking):
-    monkeypatch.setitem(sys.modules, tracking, None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'nsf\["):
-        train("basis", tmp_path, tracking=tracking)
-    assert not list(tmp_path.iterdir())

@@ -1,0 +1,196 @@
+"""A chain as one tracked run: its keys, its losses as it trains, its figures, and its files.
+
+TensorBoard, MLflow and Weights & Biases get one run a chain, named by its evaluate run; the same command goes
+on with it. Jobs of a sweep have a parent (MLflow) or a group (Weights & Biases) in common. All write into the
+folder of runs, unless their environment variables say otherwise. `tracking=csv` keeps the losses of training
+alone, in its folder.
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
+
+from nsf.extras import optional
+from nsf.runs import Run
+from nsf.storage import locked
+
+if TYPE_CHECKING:
+    from pytorch_lightning.loggers import Logger
+
+#: Tools that track a chain, each with the extra that brings it.
+EXTRAS = {"tensorboard": "track", "mlflow": "mlflow", "wandb": "wandb"}
+TRACKING = ("none", "csv", *EXTRAS)
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A tracked run of a tool.
+
+    Attributes:
+        logger: of Lightning.
+        put: adds a file; end: closes the run, as "success" or "failed".
+        new: whether its keys are to be logged.
+    """
+
+    logger: "Logger"
+    put: Callable[[Path], object]
+    end: Callable[[str], object]
+    new: bool = True
+
+
+def check_tracking(tracking: str | None) -> None:
+    """Refuse tracking by what is not installed.
+
+    Raises:
+        MissingExtraError: names the command.
+    """
+    if tracking in EXTRAS:
+        optional(tracking, EXTRAS[tracking])
+
+
+class Tracked:
+    """The tracked run of a pipeline, which begins with its first use.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`; its `group` is a parent.
+    """
+
+    def __init__(self, pipeline):
+        self._pipeline = pipeline
+        self._tool: Tool | None = None
+
+    def loggers(self, folder: Path) -> "list[Logger]":
+        """Loggers of Lightning for a phase of the training: the csv file in its folder, and the tool's."""
+        from pytorch_lightning.loggers.csv_logs import CSVLogger
+
+        kind = self._pipeline.config.tracking
+        if kind in (None, "none"):
+            return []
+        # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
+        version = str(len(list((folder / "csv").glob("*"))))
+        losses = CSVLogger(folder, name="csv", version=version, flush_logs_every_n_steps=1)
+        return [losses, self._begun().logger] if kind in EXTRAS else [losses]
+
+    def __enter__(self) -> "Tracked":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        """Add figures and files of what is there, and close the run."""
+        if self._pipeline.config.tracking not in EXTRAS or (kind and not self._tool):
+            return
+        tool = self._begun()
+        if kind is None:
+            tool.logger.log_metrics(figures(self._pipeline))
+            for path in files(self._pipeline):
+                tool.put(path)
+        tool.end("failed" if kind else "success")
+        self._tool = None
+
+    def _begun(self) -> Tool:
+        if self._tool is None:
+            pipeline = self._pipeline
+            run = pipeline.evaluation
+            start = {"tensorboard": _tensorboard, "mlflow": _mlflow, "wandb": _wandb}
+            run.root.mkdir(parents=True, exist_ok=True)
+            self._tool = start[pipeline.config.tracking](run, run.root.resolve(), pipeline.group)
+            if self._tool.new:
+                self._tool.logger.log_hyperparams(flat(OmegaConf.to_container(pipeline.config, resolve=True)))
+        return self._tool
+
+
+def flat(values: Mapping[str, Any], head: str = "") -> dict[str, Any]:
+    """Values of nested mappings by dotted keys; lists as text."""
+    plain: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            plain |= flat(value, f"{head}{key}.")
+        else:
+            plain[f"{head}{key}"] = value if isinstance(value, bool | int | float | str) else str(value)
+    return plain
+
+
+def figures(pipeline) -> dict[str, float]:
+    """Figures of the evaluate run, and the seconds of each stage, as far as they are there."""
+    seconds = {
+        f"{stage}_seconds": sum(run.manifest["seconds"] for run in runs)
+        for stage in ("simulate", "train", "encode", "teach", "deploy", "evaluate")
+        if (runs := pipeline.runs_of(stage)) and all(run.complete for run in runs)
+    }
+    found = pipeline.evaluation.manifest["metrics"] if pipeline.evaluation.complete else {}
+    return {name: value for name, value in found.items() if isinstance(value, int | float)} | seconds
+
+
+def files(pipeline) -> list[Path]:
+    """The table, the checkpoint, and the pictures of the report, as far as they are there."""
+    table = [pipeline.evaluation.file("results.csv")] if pipeline.evaluation.complete else []
+    checkpoint = [pipeline.training.file("manifold.pt")] if pipeline.training.complete else []
+    page = pipeline._kept_report()
+    return [*table, *checkpoint, *(sorted(page.parent.glob("*.png")) if page else [])]
+
+
+def _tensorboard(run: Run, folder: Path, group: str) -> Tool:
+    import numpy as np
+    from PIL import Image
+    from pytorch_lightning.loggers.tensorboard import TensorBoardLogger
+
+    home = folder / "tensorboard"
+    new = not (home / run.scene / run.hash).exists()
+    logger = TensorBoardLogger(home, name=run.scene, version=run.hash, default_hp_metric=False)
+
+    def put(path: Path) -> None:
+        if path.suffix == ".png":
+            picture = np.asarray(Image.open(path).convert("RGB"))
+            logger.experiment.add_image(path.stem, picture, dataformats="HWC")
+        else:
+            text = f"```\n{path.read_text(encoding='utf-8')}\n```" if path.suffix == ".csv" else str(path)
+            logger.experiment.add_text(path.name, text)
+
+    return Tool(logger, put, logger.finalize, new)
+
+
+def _mlflow(run: Run, folder: Path, group: str) -> Tool:
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    from mlflow import MlflowClient
+    from pytorch_lightning.loggers.mlflow import MLFlowLogger
+
+    there = os.environ.get("MLFLOW_TRACKING_URI")
+    uri = there or f"sqlite:///{folder / 'mlflow.db'}"
+    # Two processes that make the tables of a data base, or a parent, at once would fail, or make two.
+    with locked(folder / ".mlflow.lock", waiting=lambda: None):
+        client = MlflowClient(uri)
+        found = client.get_experiment_by_name(run.scene)
+        place = None if there else (folder / "mlflow").as_uri()
+        experiment = found.experiment_id if found else client.create_experiment(run.scene, place)
+
+        def named(name: str, title: str, **tags: str) -> tuple[str, bool]:
+            runs = client.search_runs([experiment], f"tags.nsf = '{name}'", max_results=1)
+            made = [] if runs else [client.create_run(experiment, tags={"nsf": name, **tags}, run_name=title)]
+            return (runs or made)[0].info.run_id, bool(made)
+
+        of = {"mlflow.parentRunId": named(group, group)[0]} if group else {}
+        run_id, new = named(run.id, run.hash, **of)
+    logger = MLFlowLogger(experiment_name=run.scene, tracking_uri=uri, run_id=run_id)
+    return Tool(logger, lambda path: client.log_artifact(run_id, str(path)), logger.finalize, new)
+
+
+def _wandb(run: Run, folder: Path, group: str) -> Tool:
+    os.environ.setdefault("WANDB_MODE", "offline")  # nothing leaves the machine unasked
+    import wandb
+    from pytorch_lightning.loggers.wandb import WandbLogger
+
+    options = {"project": "nsf", "id": run.hash, "name": f"{run.scene}/{run.hash}", "resume": "allow"}
+    logger = WandbLogger(save_dir=folder, group=group or None, **options)
+
+    def put(path: Path) -> None:
+        if path.suffix == ".png":
+            logger.experiment.log({path.stem: wandb.Image(str(path))})
+        else:
+            artifact = wandb.Artifact(f"{run.hash}-{path.stem}", type="result")
+            artifact.add_file(str(path))
+            logger.experiment.log_artifact(artifact)
+
+    return Tool(logger, put, lambda status: logger.experiment.finish(int(status != "success")))
