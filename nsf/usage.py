@@ -68,7 +68,7 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling,reduced,batch,recurrence,training] "
+        "[benches=whole,full_order,scaling,reduced,batch,recurrence,training,peers] "
         "[particles=10k,200k,1m] [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10] "
         "[folder=PATH]; sizes that suit the device by default",
     ),

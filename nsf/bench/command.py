@@ -13,7 +13,7 @@ from nsf.mpm.precision import precision_of
 from nsf.scalars import one_of
 from nsf.storage import require_folder
 
-BENCHES = ("whole", "full_order", "scaling", "reduced", "batch", "recurrence", "training")
+BENCHES = ("whole", "full_order", "scaling", "reduced", "batch", "recurrence", "training", "peers")
 """Modules of this package with `run(figures)`, which adds its figures to `Measurements`."""
 
 SCENES = ("cake", "metal")  # of benchmarks of reduced steps

@@ -69,6 +69,11 @@ _PASSES = (
     "write, each value once. Floor: the time that these bytes take a copy measured in the same run; a step "
     "cannot be faster than the floors of its passes together as long as its state does not fit into a cache."
 )
+_PEERS = (
+    "A full-order step written in Taichi, beside ours: the same law, particles, grid and Δt, and the same "
+    "positions to round-off. It is a plain program on the nodes around the body. On a CPU ours has one core; "
+    "`nsf simulate` takes runs side by side on all of them."
+)
 #: Of a reduced frame [ms]: the networks, the projection and copies between Warp and torch, and all of it
 #: (appendix of the paper, Runtime analysis; double precision, one Quadro P6000).
 _PAPER = {"reduced_cake": (1.95, 4.69), "reduced_metal": (1.78, 2.09)}
@@ -347,4 +352,5 @@ SECTIONS = (
     Section(_SIZES, _sizes, "step", step_over_particles),
     Section(_SAMPLES, _samples, "sample", step_over_sample),
     Section(_PASSES, _passes, "kernels", passes_beside_floor),
+    Section(_PEERS, _of_bench("peers")),
 )
