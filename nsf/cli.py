@@ -332,10 +332,10 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
     failed = sweep(sweeps, stages, launcher, usage.primary(stage))
     if "evaluate" in stages:
         from nsf.pipeline.outcome import outcome
-        from nsf.results.formats import terminal_table
+        from nsf.results.formats import TerminalTable
 
         if ended := outcome(sweeps, {" ".join(failure.job): failure.error for failure in failed}):
-            screen().print(terminal_table(ended[0]))
+            screen().print(TerminalTable(ended[0]))
             print(ended[1])
     for failure in failed:
         print(f"failed: {failure}", file=sys.stderr)

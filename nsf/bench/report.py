@@ -9,12 +9,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from nsf.bench.rows import FILE, WIDE, read, size_name
 from nsf.results.charts.costs import bars
 from nsf.results.columns import axis, number
-from nsf.results.formats import Rows, markdown_document, terminal_table
+from nsf.results.formats import Rows, TerminalTable, markdown_document
 from nsf.results.style import INK, PALETTE, band, figure, legend, line_style, plain_ticks, save, styled
 from nsf.storage import write_text
 
@@ -144,11 +143,11 @@ def wide(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(body)
 
 
-def table(path: Path) -> Table:
+def table(path: Path) -> TerminalTable:
     """The whole steps of a table for a terminal."""
     rows = read(path)
     constant, whole = _rows(rows[rows["part"] == ""].assign(commit=""))
-    return terminal_table(whole, constant)
+    return TerminalTable(whole, constant)
 
 
 def _rows(rows: pd.DataFrame) -> tuple[str, Rows]:

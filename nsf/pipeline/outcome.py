@@ -39,17 +39,17 @@ def outcome(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> tuple
     leaves = [key.rpartition(".")[2] for key in varied]
     names = [leaf if leaves.count(leaf) == 1 else key for key, leaf in zip(varied, leaves, strict=True)]
     shown = [COLUMNS[name] for name in (*_ERRORS, *_TIMES)]
-    headings = [*names, *(one.heading for one in shown), axis("validation error", "%"), "run"]
+    headings = [*names, axis("validation error", "%"), "run", *(one.heading for one in shown)]
     body = [
         [
             *(job.get(key, "") for key in varied),
-            *(one.cell(result.get(one.name)) for one in shown),
             number(result.get(_VALIDATION), 100),
             result["run"],
+            *(one.cell(result.get(one.name)) for one in shown),
         ]
         for job, result in zip(jobs, results, strict=True)
     ]
-    rows = Rows(headings, body, [False] * len(varied) + [True] * (len(shown) + 1) + [False])
+    rows = Rows(headings, body, [False] * len(varied) + [True, False] + [True] * len(shown))
     validated = [at for at, result in enumerate(results) if _VALIDATION in result]
     if "scene" in varied or not validated:
         return rows, ""

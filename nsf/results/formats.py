@@ -35,6 +35,9 @@ _SPECIAL = re.compile(r"\A\s*[\[*]|" + "|".join(map(re.escape, _TEX)))
 _FORMULA = re.compile(r"[=+\-@\t\r]")
 
 
+_EDGES = 2  # characters about a column of a terminal
+
+
 @dataclass(frozen=True)
 class Rows:
     """A table as text: a heading a column, and whether the column is of numbers, which align to the right."""
@@ -128,14 +131,46 @@ def latex_table(rows: Rows, title: str, note: str) -> str:
     return LATEX.get_template("table.tex").render(rows=rows, title=title, note=note)
 
 
-def terminal_table(rows: Rows, caption: str | None = None) -> rich.table.Table:
-    """A table for rich to print."""
-    table = rich.table.Table(
-        caption=terminal(caption) if caption else None, caption_justify="left", box=rich.box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-    )  # fmt: skip
-    for heading, right in zip(rows.headings, rows.numeric, strict=True):
-        table.add_column(terminal(heading), justify="right" if right else "left", overflow="fold")
-    for texts in rows.body:
-        table.add_row(*map(terminal, texts))
-    return table
+@dataclass(frozen=True)
+class TerminalTable:
+    """A table for rich to print, with the columns that a terminal has room for; the others are named below.
+
+    Headings and words are broken into lines, numbers never are.
+    """
+
+    rows: Rows
+    caption: str = ""
+
+    def __rich_console__(self, console, options):
+        """The table, in `options.max_width` characters."""
+        widths = _widths(self.rows, options.max_width - _EDGES)
+        table = rich.table.Table(box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for at, width in widths.items():
+            place = {"justify": "right" if self.rows.numeric[at] else "left", "overflow": "fold"}
+            table.add_column(terminal(self.rows.headings[at]), width=width, **place)
+        for texts in self.rows.body:
+            table.add_row(*(terminal(texts[at]) for at in widths))
+        yield table
+        hidden = [heading for at, heading in enumerate(self.rows.headings) if at not in widths]
+        lines = [self.caption, f"Hidden for want of width: {', '.join(hidden)}" if hidden else ""]
+        yield from map(terminal, filter(None, lines))
+
+
+def _widths(rows: Rows, room: int) -> dict[int, int]:
+    """Characters of the columns that fit into a room, by index: at least of their longest word or number."""
+    cells = [[row[at] for row in rows.body] for at in range(len(rows.headings))]
+    longest = [max(map(len, of), default=1) for of in cells]
+    words = [
+        max(map(len, [*heading.split(), *(of if right else " ".join(of).split())]))
+        for heading, of, right in zip(rows.headings, cells, rows.numeric, strict=True)
+    ]
+    widths: dict[int, int] = {}
+    for at, width in enumerate(words):
+        if width + _EDGES <= room or not widths:
+            widths[at] = width
+            room -= width + _EDGES
+    for at in sorted(widths, key=lambda at: not rows.numeric[at]):
+        more = min(max(longest[at] - widths[at], 0), max(room, 0))
+        widths[at] += more
+        room -= more
+    return widths

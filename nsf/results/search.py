@@ -6,10 +6,9 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from rich.table import Table
 
 from nsf.results.columns import COLUMNS, Column
-from nsf.results.formats import Rows, spreadsheet, terminal_table
+from nsf.results.formats import Rows, TerminalTable, spreadsheet
 from nsf.results.style import MUTED, PALETTE, figure, save, styled
 from nsf.results.table import parsed
 from nsf.storage import writing
@@ -46,7 +45,7 @@ def search_chart(table: pd.DataFrame, objectives: Sequence[str]) -> Figure:
     return fig
 
 
-def best_table(path: Path) -> Table:
+def best_table(path: Path) -> TerminalTable:
     """The best trials of a `trials.csv`, for the terminal: the Pareto front."""
     trials = parsed(path, ())
     best = trials[trials["pareto"]].drop(columns=["pareto", "error"])
@@ -55,7 +54,7 @@ def best_table(path: Path) -> Table:
         [column.cell(row[name]) for name, column in zip(best, columns, strict=True)]
         for row in best.to_dict("records")
     ]
-    return terminal_table(Rows([column.heading for column in columns], body, [False] * len(columns)))
+    return TerminalTable(Rows([column.heading for column in columns], body, [False] * len(columns)))
 
 
 def _front(ax, done: pd.DataFrame, objectives: Sequence[str]) -> None:

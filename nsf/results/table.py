@@ -30,7 +30,7 @@ from nsf.results.columns import (
     number,
     plus_minus,
 )
-from nsf.results.formats import Rows, spreadsheet, terminal, terminal_table
+from nsf.results.formats import Rows, TerminalTable, spreadsheet, terminal
 from nsf.storage import writing
 
 _TRAIN = "scene.design.train"  # a list, whose length is shown
@@ -49,7 +49,7 @@ _COMPUTED = (
 SAID_ONCE = ("model_name", "stress", "affine", "field", "r", "material", "particles", "precision", "device")
 """Columns that are said above a table where all rows have one value."""
 _CONSOLE = (
-    *("variant", "case", "cases", "paper_delta", "delta", "displacement_error", "displacement_interpolated"),
+    *("variant", "case", "cases", "paper_delta", "displacement_error", "delta", "displacement_interpolated"),
     *("stress_error", "speedup_step", "speedup_decoded", "fallback_share"),
 )
 _TELLING = ("variant", "case", "cases", "paper_delta")  # shown where they vary
@@ -356,7 +356,7 @@ def console_table(path: Path) -> rich.console.Group:
     same = {name for name in _TELLING if name in averages and averages[name].nunique() < 2}
     shown = [name for name in _CONSOLE if name in averages and name not in same]
     once = ", ".join(f"{title} {text}" for title, text in constants(frame, SAID_ONCE).items())
-    return rich.console.Group(terminal_table(rows_of(averages, ["body", *shown])), terminal(once))
+    return rich.console.Group(TerminalTable(rows_of(averages, ["body", *shown])), terminal(once))
 
 
 def where_rivals_win(averages: pd.DataFrame) -> str:

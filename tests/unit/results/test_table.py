@@ -4,11 +4,13 @@ import math
 
 import pandas as pd
 import pytest
+import rich.console
 from made import Made, frame
 
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.results import table
 from nsf.results.columns import BASELINE, COLUMNS, number
+from nsf.results.formats import Rows, TerminalTable
 
 
 def rows(*runs: Made, **columns) -> pd.DataFrame:
@@ -129,3 +131,18 @@ def test_every_column_has_a_meaning_and_measured_ones_a_unit():
 )
 def test_numbers_have_three_digits(value, shown):
     assert number(value) == shown
+
+
+def test_a_narrow_terminal_has_fewer_columns_and_no_broken_number():
+    rows = Rows(
+        ["name", "displacement error [%]", "step [ms]"],
+        [["a long name", "8.99e-04 ± 0.0004", "1.25"]],
+        [False, True, True],
+    )
+    console = rich.console.Console(width=32, color_system=None)
+    with console.capture() as capture:
+        console.print(TerminalTable(rows))
+    shown = capture.get()
+    assert "8.99e-04 ± 0.0004" in shown
+    assert "Hidden for want of width: step" in shown
+    assert max(map(len, shown.splitlines())) <= 32
