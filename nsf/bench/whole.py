@@ -4,6 +4,7 @@ Beside a run by recurrence stand the full-order run in both precisions, and one 
 run goes from t = 0 to the end of its scene; building is apart, as the seconds until the first frame.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -84,7 +85,7 @@ def _size_keys(scene: Scene, particles: int) -> list[str]:
     if particles == scene.particle_count:
         return []
     fine = at_size(scene, particles)
-    steps = _ROUND * max(1, round(fine.steps / _ROUND))
+    steps = _ROUND * math.ceil(fine.steps / _ROUND)  # no longer a step than the finer grid allows
     keys = {"scene.dx": fine.dx, "scene.dt": scene.dt * scene.steps / steps, "scene.steps": steps}
     keys |= {f"scene.bodies.{name}.particles": body.particles for name, body in fine.bodies.items()}
     return [f"{key}={value}" for key, value in keys.items()]

@@ -223,9 +223,10 @@ class Trust:
 
     def signal_of(self, run: ReducedMPM, first: int = 0) -> np.ndarray:
         """`signal` of a run from a step up to now."""
-        latent, members = run.trajectory(), run.members
-        residuals = None if run.span.latent_only else np.concatenate([[0.0], latent.residuals[:, -1]])[first:]
-        return self.signal(latent.xhat[first:], None if members is None else members[:, first:], residuals)
+        members, residuals = run.members, None
+        if not run.span.latent_only:
+            residuals = np.concatenate([[0.0], run.trajectory().residuals[:, -1]])[first:]
+        return self.signal(run.latents[first:], None if members is None else members[:, first:], residuals)
 
     def outside(self, run: ReducedMPM, first: int = 1) -> str:
         """Why the inputs of a run, in its steps from one on, are outside of what was taught; empty if not."""
@@ -242,9 +243,8 @@ class Trust:
             signal: [N + 1] of it, from `signal_of`.
             diverged: step at which it diverged; −1: at none.
         """
-        latent, whole = run.trajectory(), run.steps_taken == run.total_steps
-        path = latent.t, latent.xhat, signal
-        return self.judge(run.setup.values, *path, self.outside(run), diverged, whole)
+        t, whole = run.dt * np.arange(run.steps_taken + 1), run.steps_taken == run.total_steps
+        return self.judge(run.setup.values, t, run.latents, signal, self.outside(run), diverged, whole)
 
     def judge(
         self,

@@ -255,6 +255,11 @@ class ReducedMPM:
         return self.together.engine
 
     @property
+    def latents(self) -> np.ndarray:
+        """x̂ [N + 1, r] up to now, on the host."""
+        return self.record.xhat[: self.steps_taken + 1].cpu().numpy()
+
+    @property
     def members(self) -> np.ndarray | None:
         """x̂ [M, N + 1, r] of each member of its model up to now, on the host; None of a single one."""
         members = self.span.members(self.steps_taken)

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-_HOST_BYTES = 2**25  # of a block on the CPU: about its last cache
-_SHARE = 0.25  # of the free memory of a GPU
+#: [byte] of a block: on the CPU about its last cache, on a GPU so much that launching it costs nothing.
+_HOST_BYTES, _DEVICE_BYTES = 2**25, 2**29
 _ROWS = 3 * 500  # of modes at most, of which the error of tf32 is taken
 _SLICES = 128  # of a product, which a GPU works on side by side
 #: Modes of a tile of the product on the CPU [values]: about the second level of its cache.
@@ -13,11 +13,7 @@ TILE = 2**18
 
 def frames_at_once(values: int, dtype: torch.dtype, device: torch.device | str) -> int:
     """Frames of so many values each that fit into a block on a device; at least one."""
-    device, room = torch.device(device), _HOST_BYTES
-    if device.type == "cuda":
-        free, _ = torch.cuda.mem_get_info(device)
-        spare = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        room = int(_SHARE * (free + spare))
+    room = _DEVICE_BYTES if torch.device(device).type == "cuda" else _HOST_BYTES
     return max(1, room // max(1, values * dtype.itemsize))
 
 

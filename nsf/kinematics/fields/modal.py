@@ -20,6 +20,8 @@ from nsf.kinematics.manifold import Restriction
 from nsf.kinematics.training.phases import joined, shaped
 
 _CONSTANT = 1e-6  # deviation over size of coefficients below which they are taken to be constant
+#: Values of a product from which on tensor cores save more time than it takes to see how far they are off.
+_MANY = 2**28
 
 
 def at_rate(outputs: Tensor, rate: Tensor) -> Tensor:
@@ -146,14 +148,16 @@ class RestrictedField:
     def blocks(self, inputs: Tensor, tolerance: float = 0.0) -> Iterator[Tensor]:
         """`values` [f, n, c] of inputs [F, ·], all blocks of frames in one memory.
 
-        A block is one product on a GPU, in tf32 where that is off by no more than `tolerance` of modes times
-        coefficients. On the CPU it is one for each part of the points whose modes stay in the cache.
+        A block is one product on a GPU; many values are made in tf32, where that is off by no more than
+        `tolerance` of modes times coefficients. On the CPU it is one for each part of the points whose modes
+        stay in the cache.
         """
         modes, mean = self.modes.flatten(0, 1), self.mean.flatten()
         size = min(len(inputs), frames_at_once(len(mean), mean.dtype, mean.device))
         with torch.no_grad():
             a, memory = self._coefficients(inputs), mean.new_empty(size, len(mean))
             tensor_cores = tolerance > 0 and mean.is_cuda and mean.dtype == torch.float32
+            tensor_cores &= len(a) * len(mean) >= _MANY
             fast = tensor_cores and tf32_error(a[:: max(1, len(a) // 16)], modes) <= tolerance
         width = len(mean) if mean.is_cuda else max(1, TILE // modes.shape[1])
         tiles = [slice(start, start + width) for start in range(0, len(mean), width)]
