@@ -211,7 +211,7 @@ def _init(arguments: list[str]) -> int:
     mesh = Mesh(options["mesh"], unit=options.get("unit", ""), up=options.get("up", "z")) if options else None
     name = write_project(folder, mesh)
     chain = f"--config-dir conf scene={name}"
-    commands = f"cd {folder}", "pip install -e '.[test]'", f"nsf plan {chain}", f"nsf run {chain}"
+    commands = f"cd {folder}", "pip install -e .", f"nsf plan {chain}", f"nsf run {chain}"
     print(f"wrote {folder}; next:", *commands, f"{folder / 'README.md'} says what to change", sep="\n  ")
     return 0
 

@@ -42,6 +42,15 @@ def test_names_of_no_package(tmp_path, name, told):
     assert not any(tmp_path.iterdir())
 
 
+def test_a_project_that_is_not_installed(tmp_path, monkeypatch, capsys):
+    write_project(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path / "mine")
+    monkeypatch.setenv("NSF_CONFIG", "conf")
+    with pytest.raises(SystemExit):
+        main(["plan", "scene=mine"])
+    assert "pip install -e ." in capsys.readouterr().err
+
+
 @pytest.fixture
 def plate(tmp_path, monkeypatch):
     """A project with a mesh of 16 mm thickness, as if it were installed, and its pipeline."""

@@ -12,6 +12,7 @@ import inspect
 import re
 import typing
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -205,7 +206,9 @@ def _kind(path: tuple[str, ...], target: Any) -> Kind:
     if not (
         _NAME.fullmatch(str(target)) and (target.startswith(f"{kind.package}.") or _is_installed(target))
     ):
-        raise ConfigError(f"{refused}name a {_noun(kind)} {_homes(kind)}")
+        here = Path(str(target).partition(".")[0]).is_dir() and Path("pyproject.toml").is_file()
+        install = "; pip install -e . installs that of this folder" if here else ""
+        raise ConfigError(f"{refused}name a {_noun(kind)} {_homes(kind)}{install}")
     return kind
 
 

@@ -1,4 +1,4 @@
-"""The law of this project: how the yield stress grows as the body flows."""
+"""The hardening law of this project."""
 
 import math
 from dataclasses import dataclass
@@ -8,12 +8,12 @@ from nsf.mpm.materials import IsotropicHardening
 
 @dataclass(frozen=True)
 class Law(IsotropicHardening):
-    """Voce hardening, from `yield_stress` towards `saturation`. Each constant has a value in law.yaml."""
+    """Voce hardening: from `yield_stress` towards `saturation`. `E` and `nu` are inherited."""
 
     yield_stress: float  # [Pa]
     saturation: float  # [Pa]
     rate: float  # [-]
 
     def flow_stress(self, gamma):
-        """Largest ‖dev τ‖ [Pa] at the plastic strain γ; a number here is `type(gamma)(2.0)`."""
+        """Largest ‖dev τ‖ [Pa] at the plastic strain γ; write a number as `type(gamma)(2.0)`."""
         return self.saturation + (self.yield_stress - self.saturation) * math.exp(-self.rate * gamma)
