@@ -99,6 +99,8 @@ def delta(view: View) -> Figures:
         panel.tick_params(axis="x", labelbottom=True)
     for panel in drawn:
         error_scale(panel, every, "x")
+        if panel.get_xscale() == "linear":
+            panel.locator_params(axis="x", nbins=5)
     legend(fig)
     return {"delta": fig}
 
