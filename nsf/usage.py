@@ -68,9 +68,9 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=whole,full_order,scaling,reduced,batch,recurrence,training,peers] "
-        "[particles=10k,200k,1m] [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10] "
-        "[folder=PATH]; sizes that suit the device by default",
+        "[benches=whole,full_order] [particles=10k,200k,1m] [scenes=cake,metal] [precision=fp32,fp64] "
+        "[device=auto] [trials=10] [folder=PATH]; benches are whole, full_order, scaling, reduced, batch, "
+        "recurrence, training and peers; all, and sizes that suit the device, by default",
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
