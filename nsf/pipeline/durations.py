@@ -155,10 +155,10 @@ def interval(work: Work, times: Sequence[tuple[Work, float]]) -> Interval:
     middle = statistics.median(ratios)
     spread = sum((ratio - middle) ** 2 for ratio in ratios)
     noise = (spread + _PRIOR * _NOISE**2) / (n + _PRIOR) * (1 + 1 / n)
-    how = "" if near[-1][0] < _OTHER_SCENE else ", other scenes" if near[-1][0] < _OTHER_KIND else ", unlike"
-    return _around(
-        work.expected * math.exp(middle), math.sqrt(noise + near[-1][0] ** 2), f"{n} time{'s' * (n > 1)}{how}"
-    )
+    least = near[-1][0]
+    how = "" if least < _OTHER_SCENE else ", other scenes" if least < _OTHER_KIND else ", unlike"
+    like = f"{n} time{'s' * (n > 1)}{how}"
+    return _around(work.expected * math.exp(middle), math.sqrt(noise + least**2), like)
 
 
 def times(folder: Path) -> list[tuple[Work, float]]:
@@ -170,9 +170,9 @@ def times(folder: Path) -> list[tuple[Work, float]]:
     except OSError:
         return []
     done = []
-    for row in csv.reader(reversed(lines)):
-        with suppress(ValueError, TypeError):
-            *names, expected, seconds = row
+    for line in reversed(lines):
+        with suppress(ValueError, TypeError, StopIteration, csv.Error):
+            *names, expected, seconds = next(csv.reader([line]))
             if min(float(expected), float(seconds)) > 0.0 and float(expected) + float(seconds) < math.inf:
                 done.append((Work(*names, float(expected)), float(seconds)))
     return done
@@ -247,7 +247,8 @@ def _reduced(pipeline, rates: Rates) -> float:
     """A reduced run."""
     if not isinstance(pipeline.configured, Projected):
         return rates.reduced_run
-    sample = int(pipeline.config.sampler.get("size") or pipeline.config.reduction.sample)
+    size = pipeline.config.sampler.get("size")
+    sample = size if isinstance(size, int) else pipeline.config.reduction.sample
     steps = pipeline.deployed.steps / pipeline.config.deploy.dt_multiplier
     return rates.reduced_run + steps * (rates.reduced_step + rates.sample_step * sample)
 

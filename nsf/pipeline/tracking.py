@@ -32,11 +32,13 @@ class Tool:
 
     Attributes:
         logger: of Lightning.
-        put: adds a file; end: closes the run, as "success" or "failed".
+        conclude: adds figures, beside the keys; put: adds a file.
+        end: closes the run, as "success" or "failed".
         new: whether its keys are to be logged.
     """
 
     logger: "Logger"
+    conclude: Callable[[Mapping, Mapping], object]
     put: Callable[[Path], object]
     end: Callable[[str], object]
     new: bool = True
@@ -84,7 +86,7 @@ class Tracked:
             return
         tool = self._begun()
         if kind is None:
-            tool.logger.log_metrics(figures(self._pipeline))
+            tool.conclude(self._keys(), figures(self._pipeline))
             for path in files(self._pipeline):
                 tool.put(path)
         tool.end("failed" if kind else "success")
@@ -98,8 +100,11 @@ class Tracked:
             run.root.mkdir(parents=True, exist_ok=True)
             self._tool = start[pipeline.config.tracking](run, run.root.resolve(), pipeline.group)
             if self._tool.new:
-                self._tool.logger.log_hyperparams(flat(OmegaConf.to_container(pipeline.config, resolve=True)))
+                self._tool.logger.log_hyperparams(self._keys())
         return self._tool
+
+    def _keys(self) -> dict[str, Any]:
+        return flat(OmegaConf.to_container(self._pipeline.config, resolve=True))
 
 
 def flat(values: Mapping[str, Any], head: str = "") -> dict[str, Any]:
@@ -116,12 +121,13 @@ def flat(values: Mapping[str, Any], head: str = "") -> dict[str, Any]:
 def figures(pipeline) -> dict[str, float]:
     """Figures of the evaluate run, and the seconds of each stage, as far as they are there."""
     seconds = {
-        f"{stage}_seconds": sum(run.manifest["seconds"] for run in runs)
+        f"seconds/{stage}": sum(run.manifest["seconds"] for run in runs)
         for stage in ("simulate", "train", "encode", "teach", "deploy", "evaluate")
         if (runs := pipeline.runs_of(stage)) and all(run.complete for run in runs)
     }
-    found = pipeline.evaluation.manifest["metrics"] if pipeline.evaluation.complete else {}
-    return {name: value for name, value in found.items() if isinstance(value, int | float)} | seconds
+    metrics = pipeline.evaluation.manifest["metrics"] if pipeline.evaluation.complete else {}
+    means = {f"results/{name}": value for name, value in metrics.items() if isinstance(value, int | float)}
+    return means | seconds
 
 
 def files(pipeline) -> list[Path]:
@@ -149,7 +155,8 @@ def _tensorboard(run: Run, folder: Path, group: str) -> Tool:
             text = f"```\n{path.read_text(encoding='utf-8')}\n```" if path.suffix == ".csv" else str(path)
             logger.experiment.add_text(path.name, text)
 
-    return Tool(logger, put, logger.finalize, new)
+    # Keys without figures would not be shown.
+    return Tool(logger, logger.log_hyperparams, put, logger.finalize, new)
 
 
 def _mlflow(run: Run, folder: Path, group: str) -> Tool:
@@ -157,24 +164,30 @@ def _mlflow(run: Run, folder: Path, group: str) -> Tool:
     from mlflow import MlflowClient
     from pytorch_lightning.loggers.mlflow import MLFlowLogger
 
-    there = os.environ.get("MLFLOW_TRACKING_URI")
-    uri = there or f"sqlite:///{folder / 'mlflow.db'}"
+    server = os.environ.get("MLFLOW_TRACKING_URI")
+    uri = server or f"sqlite:///{folder / 'mlflow.db'}"
     # Two processes that make the tables of a data base, or a parent, at once would fail, or make two.
     with locked(folder / ".mlflow.lock", waiting=lambda: None):
         client = MlflowClient(uri)
-        found = client.get_experiment_by_name(run.scene)
-        place = None if there else (folder / "mlflow").as_uri()
-        experiment = found.experiment_id if found else client.create_experiment(run.scene, place)
+        place = None if server else (folder / "mlflow").as_uri()
+        earlier = client.get_experiment_by_name(run.scene)
+        experiment = earlier.experiment_id if earlier else client.create_experiment(run.scene, place)
 
-        def named(name: str, title: str, **tags: str) -> tuple[str, bool]:
+        def begun(name: str, title: str, **tags: str) -> tuple[str, bool]:
             runs = client.search_runs([experiment], f"tags.nsf = '{name}'", max_results=1)
             made = [] if runs else [client.create_run(experiment, tags={"nsf": name, **tags}, run_name=title)]
             return (runs or made)[0].info.run_id, bool(made)
 
-        of = {"mlflow.parentRunId": named(group, group)[0]} if group else {}
-        run_id, new = named(run.id, run.hash, **of)
+        of = {"mlflow.parentRunId": begun(group, group)[0]} if group else {}
+        run_id, new = begun(run.id, run.hash, **of)
     logger = MLFlowLogger(experiment_name=run.scene, tracking_uri=uri, run_id=run_id)
-    return Tool(logger, lambda path: client.log_artifact(run_id, str(path)), logger.finalize, new)
+    return Tool(
+        logger,
+        lambda keys, values: logger.log_metrics(values),
+        lambda path: client.log_artifact(run_id, str(path)),
+        logger.finalize,
+        new,
+    )
 
 
 def _wandb(run: Run, folder: Path, group: str) -> Tool:
@@ -193,4 +206,9 @@ def _wandb(run: Run, folder: Path, group: str) -> Tool:
             artifact.add_file(str(path))
             logger.experiment.log_artifact(artifact)
 
-    return Tool(logger, put, lambda status: logger.experiment.finish(int(status != "success")))
+    return Tool(
+        logger,
+        lambda keys, values: logger.log_metrics(values),
+        put,
+        lambda status: logger.experiment.finish(int(status != "success")),
+    )

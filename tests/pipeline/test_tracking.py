@@ -33,12 +33,12 @@ class Fake:
 
     def __call__(self, run, folder, group):
         self.calls.append(("begin", run.id, group))
-        return Tool(self, self.put, self.end)
+        return Tool(self, self.conclude, self.put, self.end)
 
     def log_hyperparams(self, keys):
         self.calls.append(("keys", keys))
 
-    def log_metrics(self, values):
+    def conclude(self, keys, values):
         self.calls.append(("figures", values))
 
     def put(self, path):
@@ -57,8 +57,9 @@ def test_keys_figures_and_files(tracked, monkeypatch):
     assert values[0] == pipeline.evaluation.id
     assert values[1]["scene.bodies.column.particles"] == 500
     assert values[1]["model.name"] == "projected"
-    assert values[2]["delta"] == pytest.approx(figures(pipeline)["delta"])
-    assert {"displacement_error", "stress_error", "memory_mib", "train_seconds"} <= {*values[2]}
+    assert values[2] == figures(pipeline)
+    named = {f"results/{name}" for name in ("delta", "displacement_error", "stress_error", "memory_mib")}
+    assert {*named, "seconds/train"} <= {*values[2]}
     assert values[3:] == ("results.csv", "manifold.pt", "success")
 
 
@@ -97,8 +98,9 @@ def test_tensorboard(tracked):
     pipeline = tracked("tensorboard")
     run = pipeline.evaluation
     events = EventAccumulator(str(run.root / "tensorboard" / run.scene / run.hash)).Reload()
-    (delta,) = events.Scalars("delta")
-    assert delta.value == pytest.approx(figures(pipeline)["delta"])
+    (delta,) = events.Scalars("results/delta")
+    assert delta.value == pytest.approx(figures(pipeline)["results/delta"])
+    assert "_hparams_/session_start_info" in events.summary_metadata
     assert {"results.csv/text_summary", "manifold.pt/text_summary"} <= {*events.Tags()["tensors"]}
 
 
@@ -117,7 +119,7 @@ def test_mlflow(tracked, monkeypatch):
     run = runs[pipeline.evaluation.id]
     assert run.info.status == "FINISHED"
     assert run.data.params["latent_dim"] == "4"
-    assert run.data.metrics["delta"] == pytest.approx(figures(pipeline)["delta"])
+    assert run.data.metrics["results/delta"] == pytest.approx(figures(pipeline)["results/delta"])
     assert {file.path for file in client.list_artifacts(run.info.run_id)} == {"results.csv", "manifold.pt"}
 
 

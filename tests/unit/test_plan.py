@@ -116,9 +116,8 @@ def test_an_interval_is_narrow_where_like_work_was_measured_often(tmp_path):
     assert other.like == "8 times, other scenes"
     assert other.low < often.low < often.high < other.high
     assert interval(work, [(replace(work, device="cuda:0"), 30.0)]) == guess
-    (tmp_path / FILE).write_text(
-        "train,sand,BasisField,cpu,10,30\nno line,\ntrain,sand,BasisField,cpu,0,nan\n"
-    )
+    broken = ("no line,", "", 140_000 * "a", "train,sand,BasisField,cpu,0,nan")
+    (tmp_path / FILE).write_text("\n".join(["train,sand,BasisField,cpu,10,30", *broken]))
     assert times(tmp_path) == [(work, 30.0)]
 
 
