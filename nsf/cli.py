@@ -79,9 +79,9 @@ def _dispatch(arguments: list[str]) -> int:
     if stage not in STAGES:
         import difflib
 
-        known = (*STAGES, *TOOLS)
-        near = difflib.get_close_matches(stage, known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(known)}"
+        names = (*STAGES, *TOOLS)
+        near = difflib.get_close_matches(stage, names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(names)}"
         raise ConfigError(f"unknown stage {stage!r}; {hint}")
     if {"-h", "--help"} & set(overrides):
         print(usage.of_stage(stage))
@@ -95,13 +95,13 @@ def _dispatch(arguments: list[str]) -> int:
 
     launcher = [o for o in overrides if config.of_launcher(o)]
     experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
-    own = [o for o in overrides if o not in launcher and not o.startswith("+experiment=")]
+    keys = [o for o in overrides if o not in launcher and not o.startswith("+experiment=")]
     if stage != "point" and not experiments:
-        _check_scene(stage, own)
+        _check_scene(stage, keys)
     if experiments:
-        return _experiment(experiments[-1], stage, own, launcher)
+        return _experiment(experiments[-1], stage, keys, launcher)
     if multirun:
-        return _multirun(stage, own, launcher)
+        return _multirun(stage, keys, launcher)
     if launcher:
         raise ConfigError(f"{launcher[0]} is about the jobs of a sweep; add -m")
     loaded = config.load(overrides, usage.primary(stage))  # refused before the import of what would use it
@@ -118,8 +118,8 @@ def _check_scene(command: str, overrides: Sequence[str]) -> None:
     from nsf.paths import groups
 
     if not any(map(config.names_scene, overrides)):
-        known = ", ".join(groups()["scene"])
-        raise ConfigError(f"nsf {command} needs a scene, as scene=sand; choose one of {known}")
+        scenes = ", ".join(groups()["scene"])
+        raise ConfigError(f"nsf {command} needs a scene, as scene=sand; choose one of {scenes}")
 
 
 def _tool(name: str, arguments: list[str]) -> int:
@@ -224,22 +224,22 @@ def _plan(arguments: list[str]) -> int:
     flags = {"-m", "--multirun", "--cfg"}
     overrides = [word for word in arguments if word not in flags]
     words.check("plan", [word for word in overrides if not word.startswith("~")])
-    own = [o for o in overrides if not o.startswith("+experiment=") and not config.of_launcher(o)]
+    keys = [o for o in overrides if not o.startswith("+experiment=") and not config.of_launcher(o)]
     if names := [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]:
         from nsf.pipeline.experiment import Experiment
 
-        jobs = [job.overrides for job in Experiment.load(names[-1], own).jobs]
+        jobs = [job.overrides for job in Experiment.load(names[-1], keys).jobs]
     else:
-        _check_scene("plan", own)
-        jobs = config.jobs([own]) if {"-m", "--multirun"} & set(arguments) else [tuple(own)]
-    found = preview.plans(jobs)
+        _check_scene("plan", keys)
+        jobs = config.jobs([keys]) if {"-m", "--multirun"} & set(arguments) else [tuple(keys)]
+    plans = preview.plans(jobs)
     if "--cfg" in arguments:
-        print("\n---\n".join(map(preview.composed, found)), end="")
+        print("\n---\n".join(map(preview.composed, plans)), end="")
         return 0
     page = screen()
-    for plan in preview.scenes(found):
+    for plan in preview.scenes(plans):
         page.print(preview.scene_table(plan), "")
-    page.print(preview.stages_table(found))
+    page.print(preview.stages_table(plans))
     return 0
 
 
@@ -305,8 +305,8 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
         with timed("report"):
             page, missing = experiment.report()
         _show(page, table=stage == "report" or len(experiment.jobs) == 1)
-        for told in missing:
-            print(f"missing: {told}", file=sys.stderr)
+        for job in missing:
+            print(f"missing: {job}", file=sys.stderr)
         code = 2 if missing else code
     return code
 

@@ -71,11 +71,11 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
 
     Args:
         words: `key=low..high[:log]`, and `key=value` of everything else.
-        say: told of each trial.
+        say: called with a line for each trial.
         root: folder of all runs; NSF_RUNS, else ./runs.
 
     Returns:
-        The chart, beside which `trials.csv` lies.
+        The chart; `trials.csv` lies in its folder.
 
     Raises:
         MissingExtraError: Optuna is not installed.
@@ -86,7 +86,7 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
     ranges, fixed = _parted(words)
     config = configuration.load(fixed)
     with configuration.naming_the_missing():
-        objectives, trials = _asked(config)
+        objectives, trials = _objectives_and_trials(config)
     _check(ranges, fixed, root)
     study = _study(config, ranges, fixed, objectives, Path(Pipeline(config, root=root).check().training.root))
 
@@ -123,10 +123,10 @@ def best(words: Sequence[str], trials: Path) -> str:
     name = next(name for name in OBJECTIVES if name in table)
     row = table.loc[table[name].idxmin()]
     tried = [f"{r.key}={row[r.key]}" for r in ranges]
-    kept = [word for word in fixed if not word.startswith("search.")]
+    words = [word for word in fixed if not word.startswith("search.")]
     column = OBJECTIVES[name]
     score = f"{column.title} {column.cell(row[name])} {column.unit}"
-    return best_text(score, tried, [*kept, *tried])
+    return best_text(score, tried, [*words, *tried])
 
 
 def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
@@ -139,7 +139,7 @@ def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
     return ranges, [word for word, r in ranged.items() if not r]
 
 
-def _asked(config: DictConfig) -> tuple[list[str], int]:
+def _objectives_and_trials(config: DictConfig) -> tuple[list[str], int]:
     keys = configuration.section(config, "search")
     objectives = keys.objectives
     listed = (

@@ -219,9 +219,12 @@ def test_a_sweep_names_what_it_needs(tmp_path, monkeypatch):
 
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))
     seen: set[str] = set()
-    monkeypatch.setattr(
-        sweep, "_in_turn", lambda *given: seen.update(reserved(tmp_path)) or [None] * len(given[2])
-    )
+
+    def in_turn(stages, group, config_name, jobs, first):
+        seen.update(reserved(tmp_path))
+        return [None] * len(jobs)
+
+    monkeypatch.setattr(sweep, "_in_turn", in_turn)
     jobs = ["scene=sand", "scale=small", "device=cpu", "latent_dim=2,3", "scene.design.train=[21,30,38.5]"]
     assert sweep.sweep([jobs], ("simulate", "train")) == []
     assert sorted(run.split("/")[0] for run in seen if "train/" in run) == ["train", "train"]

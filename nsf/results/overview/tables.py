@@ -19,7 +19,7 @@ from nsf.storage import bytes_text, size_of
 _MOST = 6  # keys that have a column, beside those of `TITLES` and those that are named
 _WIDEST = 28  # characters of a cell of a terminal
 #: Metrics that have a column where there is room for it.
-_RESULTS = ("delta", "stress_error", "error_bound", "step_ms_full", "step_ms")
+_RESULTS = ("delta", "stress_error", "validation_error", "error_bound", "step_ms_full", "step_ms")
 _WIDE = 1000  # characters of a line that no terminal shows, where no text is cut
 _GAP = 2  # characters between columns
 
@@ -141,7 +141,7 @@ def _metric(entry: Entry, of: str) -> str:
 
 
 def run_table(run: Run, everything: Sequence[Run]) -> Table:
-    """All that is known of one run.
+    """All of one run.
 
     Args:
         run: whole, half-made or broken.
