@@ -4,16 +4,21 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 from omegaconf import OmegaConf
 from rich.markup import escape
 from rich.table import Table
 
 from nsf import config as configuration
+from nsf.data.case import Case, with_unit
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.durations import STAGES, START, Interval, crowding, due, interval, times, work_of
 from nsf.runs import Run
 from nsf.storage import bytes_text
+
+#: Values of cases that a plan lists one by one; of more it has the ranges.
+_MOST_VALUES = 8
 
 
 @dataclass(frozen=True)
@@ -138,8 +143,7 @@ def scene_table(pipeline: Pipeline) -> Table:
         cells = thickness / scene.dx
         rows[f"thinnest of {name}"] = "2 cells or more" if math.isinf(cells) else f"{cells:.2g} cells"
     for part in ("train", "validation", "test"):
-        cases = getattr(pipeline.split, part)
-        rows[part] = f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
+        rows[part] = _values_of(getattr(pipeline.split, part))
     rows["memory"] = _memory(pipeline)
     c = pipeline.config
     rows["deployed"] = f"on {pipeline.device}, model {pipeline.configured.name}, r {c.latent_dim}"
@@ -150,6 +154,16 @@ def scene_table(pipeline: Pipeline) -> Table:
     for key, value in [*rows.items(), *(("warning", line) for line in warnings if line)]:
         table.add_row(key, escape(value))
     return table
+
+
+def _values_of(cases: Sequence[Case]) -> str:
+    """How many cases, and their values; the range of each parameter where these are many."""
+    if sum(map(len, cases)) <= _MOST_VALUES:
+        return f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
+    columns = zip(*(case.numbers for case in cases), strict=True)
+    ranges = zip_longest(cases[0].names, columns, cases[0].units, fillvalue="")
+    texts = [f"{name} {min(v):.4g} to {with_unit(f'{max(v):.4g}', unit)}" for name, v, unit in ranges]
+    return f"{len(cases)}: {', '.join(texts)}"
 
 
 def scenes(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
