@@ -64,7 +64,7 @@ def test_an_array_that_slurm_refuses_has_no_results_of_an_earlier_one(tmp_path):
         module._launched(SlurmLauncher(), print, [["scene=sand"]], 1)
 
 
-def says_its_gpu(config, stages, folder, labels=()):
+def says_its_gpu(config, stages, folder, labels=(), group=""):
     (folder / f"{config.seed}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
     # The first job ends only once the other process has begun one, so that neither takes them all.
     began = time.monotonic()
@@ -88,7 +88,7 @@ def test_each_line_of_a_job_beside_others_names_it(tmp_path, monkeypatch, capsys
         job=SimpleNamespace(num=1), overrides=SimpleNamespace(task=["scene=sand", "seed=2"])
     )
     monkeypatch.setattr(module.HydraConfig, "get", lambda: job)
-    monkeypatch.setattr(module, "work", lambda config, stages, say: say("train: begins"))
+    monkeypatch.setattr(module, "work", lambda config, stages, say, group: say("train: begins"))
     config = configuration.load(tiny)
     assert module._job(config, ["train"], ["seed=1", "seed=2"]) is None
     assert capsys.readouterr().out.splitlines() == [
@@ -99,7 +99,7 @@ def test_each_line_of_a_job_beside_others_names_it(tmp_path, monkeypatch, capsys
     assert capsys.readouterr().out.splitlines() == ["--- scene=sand seed=2", "train: begins"]
 
 
-def raises(config, stages, say):
+def raises(config, stages, say, group):
     raise ValueError("not foreseen")
 
 
