@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from nsf import paths
-
 ROOT = Path(__file__).parents[1]
 
 
@@ -42,28 +40,16 @@ def nsf(*arguments, **options):
     )
 
 
-def test_help_lists_stages_and_groups():
-    done = nsf("--help")
-    assert done.returncode == 0
-    unwrapped = " ".join(done.stdout.split())
-    for group, options in paths.groups().items():
-        assert f" {group} {' '.join(options)} " in unwrapped, group
-    for stage in ("simulate", "train", "deploy", "evaluate", "report", "run", "point"):
-        assert re.search(rf"^ +{stage} ", done.stdout, re.MULTILINE), stage
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["train", "--help"], ["search", "--help"], ["runs", "--help"]]
-)
-def test_help_does_not_wait_for_torch(arguments):
+def test_help_does_not_wait_for_torch():
     """Half a second: 0.04 s without these imports, 3 s with them."""
-    code = f"""
+    code = """
 import sys
+from contextlib import suppress
 from nsf.cli import main
-try:
-    main({arguments})
-except SystemExit:
-    assert not {{"torch", "warp", "hydra", "omegaconf", "pandas", "numpy", "rich"}} & set(sys.modules)
+for words in ([], ["train"], ["search"], ["runs"], ["export"]):
+    with suppress(SystemExit):
+        main([*words, "--help"])
+assert not {"torch", "warp", "hydra", "omegaconf", "pandas", "numpy", "rich"} & set(sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

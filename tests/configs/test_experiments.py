@@ -95,15 +95,10 @@ def test_parts_of_table1_share_runs():
 
 
 @pytest.mark.parametrize("experiment", QUESTIONS, ids=lambda experiment: experiment.name)
-def test_jobs_are_told_apart(experiment):
+def test_jobs_are_told_apart_and_have_what_the_paper_prints(experiment):
     """By what a run is, not only by how it is measured."""
-    jobs = experiment.jobs
-    assert len({frozenset(job.keys.items()) for job in jobs}) == len(jobs)
-
-
-@pytest.mark.parametrize("experiment", QUESTIONS, ids=lambda experiment: experiment.name)
-def test_what_the_paper_prints_is_of_a_job(experiment):
     jobs = [job.keys for job in experiment.jobs]
+    assert len({frozenset(keys.items()) for keys in jobs}) == len(jobs)
     for entry in experiment.printed or ():
         wanted = {key: value for key, value in entry.items() if key not in ("delta", "parameter")}
         assert any(all(job.get(key, "null") == wanted[key] for key in wanted) for job in jobs), entry

@@ -10,8 +10,8 @@ from fuzz import VIOLATIONS, drawn
 
 from nsf.errors import ConfigError
 
-CASES = 8  # of each kind
-SLOW = {"evaluations": 2, "intermediates": 2}  # of kinds that draw charts or train
+CASES = 4  # of each kind
+SLOW = {"evaluations": 1, "intermediates": 1}  # of kinds that draw charts or train
 SEED = 2023  # not that of `make fuzz`
 
 

@@ -77,26 +77,14 @@ def test_control_c(nsf, copied, pipeline_at, stage):
     nothing_half_written(root)
 
 
-@pytest.mark.parametrize("call", [30, 260, 499])
-def test_a_resumed_training_ends_with_the_same_bits(nsf, copied, pipeline_at, chain, call):
-    """In the first block of the first phase, in the second phase, and in the last block of it."""
+def test_a_resumed_training_ends_with_the_same_bits(nsf, copied, pipeline_at, chain):
+    """Here in its second phase; tests of trainings have the other moments."""
     root = copied("simulate")
-    assert (
-        nsf(
-            "train", root, faults=[SignalAt("nsf.kinematics.training.lightning:FieldTraining._step", call)]
-        ).code
-        == 130
-    )
+    moment = SignalAt("nsf.kinematics.training.lightning:FieldTraining._step", 260)
+    assert nsf("train", root, faults=[moment]).code == 130
     pipeline = pipeline_at(root)
     pipeline.run("train")
     assert same_weights(pipeline.training.path / "manifold.pt", chain.checkpoint)
-
-
-def test_another_seed_gives_other_bits(copied, pipeline_at, chain):
-    """What the test above compares can differ."""
-    pipeline = pipeline_at(copied("simulate"), "seed=1")
-    pipeline.run("train")
-    assert not same_weights(pipeline.training.path / "manifold.pt", chain.checkpoint)
 
 
 @pytest.mark.slow

@@ -47,6 +47,7 @@ def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeyp
     assert not any(solver() for solver in solvers)
 
 
+@pytest.mark.slow
 def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_path, monkeypatch):
     """Bit for bit, and the bar ends at its total."""
     counted = []

@@ -298,6 +298,12 @@ def test_point_gives_the_laws_values(nsf, tmp_path):
     assert last["tau_xx"] == pytest.approx(7641.432412, rel=1e-9)
 
 
+def test_extremes_of_a_point_are_those_of_the_whole_path(nsf):
+    """A cyclic path ends where it began, with next to no stress."""
+    _, out, _ = nsf("point", "material=hencky", "path=cyclic_shear", "point.points=21", tiny_scene=False)
+    assert float(out.splitlines()[0].split("up to ")[1].split()[0]) > 1e4
+
+
 def test_a_folder_that_cannot_be_written_is_told(nsf, tmp_path):
     (tmp_path / "reports").touch()
     code, _, err = nsf("point", tiny_scene=False)

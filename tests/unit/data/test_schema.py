@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 
-import nsf.data
 from nsf.data import TAU_MATRIX, TAU_ORDER, hash_of_positions
 from nsf.data.schema import COMPONENTS, UNITS, packed
 from nsf.errors import ShapeError
@@ -45,13 +44,6 @@ def test_the_hash_refuses_what_is_no_positions(X):
 
 def test_every_field_has_a_unit():
     assert COMPONENTS.keys() <= UNITS.keys()
-
-
-def test_every_public_name_is_there():
-    for name in nsf.data.__all__:
-        assert getattr(nsf.data, name) is not None
-    with pytest.raises(AttributeError, match="Trajctory"):
-        nsf.data.Trajctory  # noqa: B018
 
 
 def test_writing_needs_no_torch():

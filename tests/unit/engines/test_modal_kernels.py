@@ -7,13 +7,10 @@ import pytest
 import torch
 import warp as wp
 
-from nsf.data import TAU_MATRIX
-from nsf.dynamics.interop import as_vectors
 from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.closure import packed_weights, projection_block
-from nsf.engines.modal.gathering import THREADS, make_contraction, make_gathering, tiling
+from nsf.engines.modal.gathering import THREADS, tiling
 from nsf.engines.modal.networks import make_layer, make_product, product_blocks
-from nsf.engines.modal.placing import make_neighbours, make_sample
 from nsf.engines.modal.projection import (
     EVALUATE,
     PREPARE,
@@ -61,44 +58,6 @@ def test_tiles_hold_all():
     assert tiling(64, 10**6) == (64, 1)
 
 
-@pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
-@pytest.mark.parametrize(
-    ("coefficients", "half"), [(torch.float64, True), (torch.float32, True), (torch.float64, False)]
-)
-@pytest.mark.parametrize("fields", [(6,), (9,), (6, 9)])
-def test_contraction(arena, rng, n, K, simulations, fields, coefficients, half):
-    needed = rng.integers(0, 2, (simulations, n))
-    (tiles, tile), of = tiling(simulations), wp.dtype_from_torch(coefficients)
-    bits = arena.hold(as_bits(needed, tiles, tile), torch.int32)
-    sides, threads, sizes, results = [], [], [], []
-    for more, components in enumerate(fields):
-        k = K + 5 * more
-        mean, modes = (values_of(arena, rng, n, components, *last).float() for last in ((), (k,)))
-        a = arena.hold(rng.standard_normal((simulations, k)), coefficients)
-        whole = arena.modes(modes), arena.hold(np.ones(k), torch.float64)
-        stored, lengths = arena.halved(modes) if half else whole
-        read = (modes / lengths).to(stored.dtype).double() * lengths
-        expected = mean.double() + torch.einsum("nck,bk->bnc", read, a.double())
-        found = arena.zeros(simulations * n, 3, 3)
-        mean = arena.hold(mean, torch.float64)
-        sides.append({"mean": mean, "modes": stored, "lengths": lengths, "a": a, "values": found})
-        threads.append(arena.whole_blocks(components // 3 * n, THREADS))
-        sizes.append(-(-k // 4))
-        results.append((found, expected.cpu().numpy().reshape(simulations * n, components)))
-    kind = wp.dtype_from_torch(stored.dtype)
-    kernel = make_contraction(arena.precision, (sizes[0], sizes[-1]), of, tile, tiles > 1, kind)
-    arena.pack(
-        kernel, tiles * sum(threads), THREADS, in_N=bits, one=sides[0], two=sides[-1], threads=threads[0],
-        tiles=tiles, lanes=arena.lanes(THREADS),
-    ).launch()  # fmt: skip
-    wp.synchronize_device(arena.device)
-    for found, expected in results:
-        symmetric = expected.shape[1] == 6
-        expected = expected[:, TAU_MATRIX] if symmetric else expected.reshape(-1, 3, 3)
-        expected = expected * needed.reshape(-1, 1, 1)
-        np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-12, atol=1e-12)
-
-
 def test_half_precision_is_of_a_gpu_and_takes_lengths_out(arena, rng):
     modes = values_of(arena, rng, 7, 9, 6).float() * torch.logspace(-8, 6, 6, device=arena.zeros(1).device)
     stored, lengths = arena.halved(modes)
@@ -125,82 +84,6 @@ def test_modes_are_those_of_the_rows_however_many_are_taken_at_once(arena, rng, 
         torch.testing.assert_close(halves, (whole[0] / 3.0).half(), rtol=0, atol=0)
     first = whole[0].view(3, 2, 5, 4)[:, :, 0] if arena.device.is_cuda else whole[0].view(5, 3, 2, 4)[0]
     torch.testing.assert_close(first.flatten(1)[:, :6], table[4], rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
-def test_where_the_sample_and_its_neighbours_are(arena, rng, n, K, simulations):
-    """x and v are mean + Σ_k b_k a_k and its rate; others are needed if their stencil meets one of S's."""
-    s, dx, nodes, scale = 7, 0.5, 40, 0.02
-    modes = scale * values_of(arena, rng, n, 3, K).float()
-    mean = arena.hold(8.0 + 3.0 * rng.random((n, 3)), torch.float64)
-    start = values_of(arena, rng, simulations * n, 3)
-    a, rate = (values_of(arena, rng, simulations, K) for _ in range(2))
-    x, v = (arena.zeros(simulations * n, 3) for _ in range(2))
-    shown = [as_vectors(values, arena.precision) for values in (mean, start, x, v)]
-    lower, extent, shape = wp.vec3i(4, 4, 4), wp.vec3i(32, 32, 32), wp.vec3i(nodes, nodes, nodes)
-    count = arena.zeros(simulations, 2, dtype=torch.int64)
-    stamps = arena.zeros(simulations, 32**3, dtype=torch.int32)
-    step = arena.hold(np.arange(1, simulations + 1), torch.int32)
-    (tiles, tile), lanes, warp = tiling(simulations), arena.lanes(THREADS), arena.lanes(32)
-    needed = arena.zeros(tiles, n, dtype=torch.int32)
-    stored, lengths = arena.halved(modes[s:])
-    read = modes.double()
-    read[s:] = (modes[s:] / lengths).to(stored.dtype).double() * lengths
-    kind, several = wp.dtype_from_torch(stored.dtype), simulations > 1
-    taken = 0
-    for first in (np.arange(simulations) % 2, np.arange(1, simulations + 1) % 2):
-        motion = {
-            "mean": shown[0], "initial_velocity": shown[1], "x": shown[2], "v": shown[3], "a": a,
-            "step": step, "stamps": stamps, "count": count, "lower": lower, "extent": extent, "of_sample": s,
-            "rate": rate, "first": arena.hold(first, torch.int32), "inv_dx": wp.float64(1.0 / dx),
-        }  # fmt: skip
-        sample, others = (
-            make_sample(arena.precision, "quadratic", several),
-            make_neighbours(arena.precision, "quadratic", -(-K // 4), tile, tiles > 1, kind),
-        )
-        arena.pack(
-            sample, simulations * s * warp, at=motion, modes=arena.modes(modes[:s]), grid_shape=shape,
-            lanes=warp,
-        ).launch()  # fmt: skip
-        arena.pack(
-            others, tiles * arena.whole_blocks(n - s, THREADS), THREADS, at=motion, modes=stored,
-            lengths=lengths, in_N=needed, tiles=tiles, lanes=lanes,
-        ).launch()  # fmt: skip
-        wp.synchronize_device(arena.device)
-        places, moved = (torch.einsum("nck,bk->bnc", read, c).cpu().numpy() for c in (a, rate))
-        places += mean.cpu().numpy()
-        base = np.floor(places / dx - 0.5)
-        apart = np.abs(base[:, :, None] - base[:, None, :s]).max(-1)
-        near = (apart <= 2).any(-1)
-        assert near.any()
-        assert not near.all()
-        taken += near.sum(1)
-        expected = np.where((first == 1)[:, None, None], start.cpu().view(-1, n, 3).numpy(), moved)
-        options = {"rtol": 1e-12, "atol": 1e-12}
-        np.testing.assert_allclose(x.cpu().view(-1, n, 3), np.where(near[..., None], places, -1.0), **options)
-        np.testing.assert_allclose(v.cpu().view(-1, n, 3).numpy()[near], expected[near], **options)
-        np.testing.assert_array_equal(needed.cpu()[:, s:], as_bits(near, tiles, tile)[:, s:])
-    np.testing.assert_array_equal(count.cpu(), np.stack([taken, np.full(simulations, 2)], 1))
-
-
-@pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
-def test_what_the_projection_takes_from_the_sample(arena, rng, n, K, simulations):
-    s, dt = 90, 0.25
-    modes = values_of(arena, rng, s, 3, K).float()
-    w = arena.hold(rng.random(s), torch.float64)
-    v = values_of(arena, rng, simulations, n, 3)
-    b, lanes = arena.zeros(simulations, K + 1), arena.lanes(THREADS)
-    velocity = as_vectors(v.flatten(0, 1), arena.precision)
-    given = {"displacement": arena.modes(modes), "v": velocity, "rows": n, "weights": w, "dt": dt, "b": b}
-    kernel = make_gathering(arena.precision, simulations > 1)
-    arena.pack(kernel, simulations * (K + 1) * lanes, THREADS, gathered=given, lanes=lanes).launch()
-    wp.synchronize_device(arena.device)
-    moved = dt * v[:, :s]
-    expected = torch.einsum("p,pck,bpc->bk", w, modes.double(), moved)
-    squares = torch.einsum("p,bpc->b", w, moved**2)
-    np.testing.assert_allclose(
-        b.cpu(), torch.cat([expected, squares[:, None]], 1).cpu(), rtol=1e-12, atol=1e-12
-    )
 
 
 def test_blocks_of_a_product_hold_all():

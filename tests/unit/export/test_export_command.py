@@ -1,6 +1,5 @@
 """`nsf export` as a user calls it."""
 
-import subprocess
 import sys
 
 import pytest
@@ -21,19 +20,6 @@ def export(chain, tmp_path, monkeypatch, capsys):
         return (end.value.code or 0, *capsys.readouterr())
 
     return call
-
-
-def test_help_does_not_wait_for_torch():
-    code = """
-import sys
-from nsf.cli import main
-try:
-    main(["export", "--help"])
-except SystemExit:
-    assert not {"torch", "warp", "hydra", "matplotlib"} & set(sys.modules)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_run_by_its_hash(export, chain, deployed, tmp_path):

@@ -49,7 +49,7 @@ def test_the_truth_is_found(model, seen, no_error):
 def test_its_standard_error_is_that_of_many_noises(model, seen, no_error):
     generator = np.random.default_rng(0)
     noisy = [
-        replace(seen, values=seen.values + 1e-4 * generator.standard_normal(len(seen))) for _ in range(8)
+        replace(seen, values=seen.values + 1e-4 * generator.standard_normal(len(seen))) for _ in range(6)
     ]
     found = [fit(View(own, model), model, error=no_error) for own in noisy]
     off = np.array([own.estimate - [27.0, 0.2] for own in found]) / found[0].standard_error

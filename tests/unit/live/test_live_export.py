@@ -169,7 +169,7 @@ def opened(browser):
     """(page, size, dark) → a tab of it without a network; a fault or a request fails the test."""
     faults = []
 
-    def open_page(page, width=1000, height=700, **options):
+    def open_page(page, width=800, height=480, **options):
         context = browser.new_context(viewport={"width": width, "height": height}, offline=True, **options)
         tab = context.new_page()
         tab.on("pageerror", lambda error: faults.append(str(error)))

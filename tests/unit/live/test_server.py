@@ -44,7 +44,8 @@ async def streaming(model, host="127.0.0.1", feed=LatentFeed, **options):
 
 
 def connected(port):
-    return connect(f"ws://127.0.0.1:{port}/stream")
+    """A client; one that has stopped reading would wait ten seconds for its close to be answered."""
+    return connect(f"ws://127.0.0.1:{port}/stream", close_timeout=0.2)
 
 
 async def frames(connection, count):
@@ -324,8 +325,9 @@ def test_a_token_is_asked_of_every_request(model):
     asyncio.run(run())
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1", "localhost", ""])
-@pytest.mark.parametrize("token", ["", " ", "secret", "15 letters long"])
+@pytest.mark.parametrize(
+    ("host", "token"), [("0.0.0.0", ""), ("127.0.0.1", " "), ("localhost", "secret"), ("", "15 letters long")]
+)
 def test_a_token_that_can_be_guessed_is_refused(player, host, token):
     with pytest.raises(ConfigError, match=r"the token (is empty|has \d+ letters); give at least 16"):
         Stream(player, LatentFeed(player.model), host, token)
@@ -342,31 +344,17 @@ H = b"Host: 127.0.0.1\r\n"
 #: Requests as they come, and the status that answers them.
 MALFORMED = {
     "nothing of HTTP": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\r\n\r\n", 400),
-    "one word": (b"GET\r\n\r\n", 400),
-    "no version": (b"GET /\r\n\r\n", 400),
     "HTTP/1.0": (b"GET / HTTP/1.0\r\n" + H + b"\r\n", 400),
-    "HTTP/2": (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", 400),
     "another method": (b"POST / HTTP/1.1\r\n" + H + b"\r\n", 400),
     "connect": (b"CONNECT evil.example:443 HTTP/1.1\r\n" + H + b"\r\n", 400),
     "a body": (b"GET / HTTP/1.1\r\n" + H + b"Content-Length: 3\r\n\r\nabc", 400),
-    "a body in pieces": (b"GET / HTTP/1.1\r\n" + H + b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n", 400),
-    "an odd length": (b"GET / HTTP/1.1\r\n" + H + b"Content-Length: x\r\n\r\n", 400),
     "absolute form": (b"GET http://127.0.0.1/ HTTP/1.1\r\n" + H + b"\r\n", 400),
     "absolute form of another": (b"GET http://evil.example/stream HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "authority form": (b"GET 127.0.0.1:80 HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "asterisk form": (b"GET * HTTP/1.1\r\n" + H + b"\r\n", 400),
     "two slashes": (b"GET //evil.example/ HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "a path with a bracket": (b"GET //[::1 HTTP/1.1\r\n" + H + b"\r\n", 400),
     "bad percent-encoding": (b"GET /?token=%zz HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "cut percent-encoding": (b"GET /?token=%4 HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "a path that is not ASCII": ("GET /ä HTTP/1.1\r\n".encode() + H + b"\r\n", 400),
     "a token that is not ASCII": (b"GET /?token=\xff\xfe HTTP/1.1\r\n" + H + b"\r\n", 400),
     "NUL in the path": (b"GET /\x00 HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "an escape in the path": (b"GET /\x1b[31m HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "a space in the path": (b"GET /a b HTTP/1.1\r\n" + H + b"\r\n", 400),
-    "a long path": (b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\n" + H + b"\r\n", 400),
     "a long header": (b"GET / HTTP/1.1\r\n" + H + b"X: " + b"a" * 100_000 + b"\r\n\r\n", 400),
-    "many headers": (b"GET / HTTP/1.1\r\n" + H + b"X: a\r\n" * 500 + b"\r\n", 400),
     "a header without a colon": (b"GET / HTTP/1.1\r\n" + H + b"nonsense\r\n\r\n", 400),
     "a header with NUL": (b"GET / HTTP/1.1\r\n" + H + b"X: a\x00b\r\n\r\n", 400),
     "a header that goes on": (b"GET / HTTP/1.1\r\n" + H + b"X: a\r\n b\r\n\r\n", 400),
@@ -497,7 +485,8 @@ def launched(chromium):
 
 def test_a_browser_decodes_what_the_server_does(browser, address, model):
     url, player = address
-    windows, asked, faults = [browser.new_page() for _ in range(2)], [], []
+    size = {"width": 640, "height": 400}
+    windows, asked, faults = [browser.new_page(viewport=size) for _ in range(2)], [], []
     for window in windows:
         window.on("request", lambda request: asked.append(request.url))
         window.on("pageerror", lambda error: faults.append(str(error)))

@@ -105,7 +105,7 @@ def address(model):
 
 def opened(browser, url):
     """A window of the page, once it has drawn; requests elsewhere fail the test."""
-    window, asked = browser.new_page(viewport={"width": 1100, "height": 640}), []
+    window, asked = browser.new_page(viewport={"width": 800, "height": 480}), []
     window.on("request", lambda request: asked.append(request.url))
     window.goto(url)
     wait_until(lambda: window.evaluate("window.nsf && nsf.player.received.frames > 2 && nsf.state.drawn > 2"))

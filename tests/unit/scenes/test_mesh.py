@@ -272,23 +272,10 @@ class TestRefused:
     def test_no_faces(self, tmp_path, form):
         refused(write(tmp_path, (cube()[0], np.empty((0, 3), int)), form))
 
-    @pytest.mark.parametrize("form", FORMATS)
-    def test_not_finite(self, tmp_path, form):
-        vertices, faces = cube()
-        vertices[3, 1] = np.inf
-        refused(write(tmp_path, (vertices, faces), form))
-
     def test_not_finite_is_named(self, tmp_path):
         vertices, faces = cube()
-        vertices[[3, 5], 1] = np.nan
+        vertices[[3, 5], 1] = np.nan, np.inf
         refused(write(tmp_path, (vertices, faces), "binary ply"), "2 vertices are not finite")
-
-    @pytest.mark.parametrize("form", FORMATS)
-    def test_open(self, tmp_path, form):
-        vertices, faces = sphere(2)
-        refused(
-            write(tmp_path, (vertices, faces[2:]), form), "is open", " of its 192 edges are on a boundary"
-        )
 
     def test_open_edges_are_counted(self, tmp_path):
         vertices, faces = cube()
@@ -403,16 +390,10 @@ class TestDrop:
             load_scene("drop", ["scene.geometry.mesh=bunny.obj"])
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "no face with an area"),
-    ],
-)
-def test_faces_that_cannot_be_are_refused(text, told, tmp_path):
+def test_faces_without_an_area_are_refused(tmp_path):
     path = tmp_path / "odd.obj"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=told):
+    path.write_text("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n")
+    with pytest.raises(ConfigError, match="no face with an area"):
         Mesh(str(path))
 
 
