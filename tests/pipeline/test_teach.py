@@ -204,7 +204,6 @@ def test_a_model_that_learns_nothing_is_not_taught(pipeline_at, tmp_path):
             "model.stress=20 coordinates need as many runs, and there are 11; set model.runs=17",
         ),
         (("model.runs=-1",), "model.runs=-1 must be a whole number of at least 0"),
-        (("model.width=0",), "width=0 must be at least 1"),
         (
             ("+scene.program=0", "+scene.forcing.gravity.tilt={_target_: nsf.scenes.RandomTilt, angle: 20}"),
             "chooses its weights by validation programs, and scene.design.validation is 0; set it to 4",

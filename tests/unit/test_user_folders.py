@@ -87,19 +87,6 @@ def test_a_search_path_of_hydra_is_refused(folder, capsys, monkeypatch):
         config.load(["scene=other"])
 
 
-def test_a_misspelt_key_in_a_file_of_the_user(folder, monkeypatch):
-    monkeypatch.setenv(paths.VARIABLE, str(folder))
-    (folder / "scene/moon.yaml").write_text(
-        "# @package _global_\ndefaults: [drop]\n"
-        "scene: {name: moon, gravty: [0.0, 0.0, -1.62], step: 20, geometry: {heigth: 0.1}}\n"
-        "gravity: [0.0, 0.0, -1.62]\nlattent_dim: 3\n"
-    )
-    with pytest.raises(ConfigError) as refused:
-        config.load(["scene=moon"])
-    for key in ("scene.gravity", "scene.steps", "scene.geometry.height", "latent_dim"):
-        assert f"did you mean {key}?" in str(refused.value)
-
-
 @pytest.mark.slow
 def test_jobs_in_other_processes_have_it_too(folder):
     words = ["run", "-m", "scene=dune", "hydra/launcher=joblib", "trainer.steps=5", "device=cpu"]

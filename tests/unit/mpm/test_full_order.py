@@ -103,7 +103,7 @@ def test_shapes_of_the_initial_state(block, solver_of):
     ("options", "error", "message"),
     [
         ({"check_every": 0}, ConfigError, "check_every=0"),
-        ({"precision": "fp16"}, ConfigError, "precision='fp16'"),
+        ({"precision": "fp16"}, ConfigError, "precision=fp16"),
     ],
 )
 def test_bad_options(options, error, message, block, solver_of):
