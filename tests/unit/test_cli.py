@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from nsf.cli import STAGES, TOOLS, main
+from nsf.paths import groups
 
 
 @pytest.fixture
@@ -43,7 +44,8 @@ def test_help(arguments, capsys):
     out = capsys.readouterr().out
     assert end.value.code == 0
     assert all(stage in out for stage in STAGES)
-    assert re.search(r"^  scene .*\bsand\b", out, re.MULTILINE)
+    unwrapped = " ".join(out.split())
+    assert all(f" {group} {' '.join(options)} " in unwrapped for group, options in groups().items())
 
 
 @pytest.mark.parametrize("command", [(), *((name,) for name in (*STAGES, *TOOLS))])
