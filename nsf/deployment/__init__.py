@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from nsf.deployment.bound import AMBER, FLAGS, GREEN, RED, UNKNOWN, Calibration
-from nsf.deployment.reach import Band, Reach
+from nsf.deployment.reach import Band, Reach, Usual
 from nsf.deployment.rollout import FULL_ORDER, PROJECTED, Rollout, continuation_file, rollout_file
 from nsf.deployment.trust import TRUST, Trust, Verdict
 from nsf.extras import on_first_use
@@ -25,6 +25,7 @@ __all__ = [
     "Reach",
     "Rollout",
     "Trust",
+    "Usual",
     "Verdict",
     "continuation_file",
     "deploy",

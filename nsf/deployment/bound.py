@@ -1,6 +1,6 @@
 """A bound of a run's error with a promise, from runs of validation cases: plain functions of arrays.
 
-A run is never better than the best run at validation, and worse where a signal of its own, in metres, is
+A run is never better than the middle one at validation, and worse where a signal of its own, in metres, is
 larger than there. The bound is the least multiple of that which held at validation (conformal prediction):
 
     bound(t) = factor · max(curve(t) · D, slope · signal(t)),   D: RMS displacement of the run
@@ -74,8 +74,8 @@ class Calibration:
     """Errors of validation runs, from which that of a new one is bounded.
 
     Attributes:
-        t: [F] times [s]; curve: [F] their mean shape over time, as large as the best of
-            them, as a share of a run's displacement.
+        t: [F] times [s]; curve: [F] their mean shape over time, as large as the middle one
+            of them, as a share of a run's displacement.
         slope: median of error over signal [-].
         factor: on the larger of both, for a bound; typical: likewise, for the error in the middle.
         displacement: RMS over runs [m]; errors: [n] of each run, shares of its displacement.
@@ -115,7 +115,7 @@ class Calibration:
             ratios = shares * size / rms(signals)
         slope = float(np.median(ratios))
         one = cls(
-            t, shares.min() * shape, slope if math.isfinite(slope) else 0.0, 1.0, 1.0,
+            t, float(np.median(shares)) * shape, slope if math.isfinite(slope) else 0.0, 1.0, 1.0,
             float(np.sqrt(np.mean(size**2))), shares, lost,
         )  # fmt: skip
         expected = [rms(one.bound(t, signal, D)) / D for signal, D in zip(signals, size, strict=True)]

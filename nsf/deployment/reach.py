@@ -1,11 +1,14 @@
 """Ranges of parameters, forcing and states in training and teaching; outside of them no bound holds."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from nsf.recurrence.solids import FEATURES
+from nsf.vectors import drawn, spaced
 
 #: Of a value: what float32 may have moved it by.
 _ROUND_OFF = 1e-6
@@ -13,6 +16,8 @@ _ROUND_OFF = 1e-6
 _AGAIN = 2.0
 #: Of the size of the ranges of latent states: what a run may leave them by, at least and at most.
 _LEAST, _MOST = 0.1, 1.0
+#: Share of runs that are usual, states of theirs by which others are judged, and frames of a run looked at.
+_USUAL, _ROWS, _FRAMES = 0.95, 2048, 64
 
 
 @dataclass(frozen=True)
@@ -79,6 +84,54 @@ class Band:
 
 
 @dataclass(frozen=True)
+class Usual:
+    """Latent states of runs that taught a model, and how near to them others of these runs keep.
+
+    A range says little where a few runs go far: one of twenty falls over, say, and widens it for all. So half
+    of the runs judge how far the others go from them, and a new run is usual that goes no further than most.
+
+    Attributes:
+        rows: [K, r] [m] states of half of the runs.
+        leeway: [m] from the nearest of these, at any time, of `_USUAL` of the other half.
+    """
+
+    rows: np.ndarray
+    leeway: float
+
+    @classmethod
+    def of(cls, runs: np.ndarray) -> "Usual | None":
+        """Of latent states [R, N + 1, r] [m] of runs; None of too few to say what is usual."""
+        frames = runs[:, spaced(runs.shape[1], _FRAMES)]
+        judges, others = frames[::2].reshape(-1, frames.shape[2]), frames[1::2]
+        rank = math.ceil((len(others) + 1) * _USUAL - 1e-9)
+        if rank > len(others):
+            return None
+        rows = judges[drawn(len(judges), _ROWS)]
+        farthest = np.sort([_nearest(one, rows).max() for one in others])
+        return cls(rows, float(farthest[rank - 1]))
+
+    def left(self, rows: np.ndarray) -> np.ndarray:
+        """[N] whether a run with states [N, r] [m] is further off, at some of its frames; False at others."""
+        frames, far = spaced(len(rows), _FRAMES), np.zeros(len(rows), bool)
+        far[frames] = _nearest(rows[frames], self.rows) > self.leeway
+        return far
+
+    def plain(self) -> dict:
+        """Plain containers."""
+        return {"rows": np.float32(self.rows).tolist(), "leeway": self.leeway}
+
+    @classmethod
+    def read(cls, content: Mapping) -> "Usual":
+        """From plain containers."""
+        return cls(np.asarray(content["rows"], float), float(content["leeway"]))
+
+
+def _nearest(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """[n] distance of each of rows [n, r] to the nearest of others [K, r]."""
+    return cdist(rows, others).min(1)
+
+
+@dataclass(frozen=True)
 class Reach:
     """Parameters, forcing and latent states of the runs that a model learned from.
 
@@ -87,6 +140,7 @@ class Reach:
         gravity: [3] middle of all gravity [m/s²]; radius: how far from it any was [m/s²].
         solids: states of the solids that programs move; None where they move none.
         states: latent states in metres (`Trust.metric`).
+        usual: which of these are, where programs force the scene; None where it is not known.
         changed: in what the deployed scene differs from that of training; empty where it does not.
     """
 
@@ -96,6 +150,7 @@ class Reach:
     radius: float
     solids: Band | None
     states: Band
+    usual: Usual | None = None
     changed: str = ""
 
     def of_inputs(
@@ -121,8 +176,9 @@ class Reach:
         return ""
 
     def of_states(self, rows: np.ndarray) -> np.ndarray:
-        """[...] whether latent states [..., r] [m] are outside."""
-        return self.states.together(rows) > self.states.leeway
+        """[N] whether latent states [N, r] [m] of a run are outside, or no usual ones."""
+        outside = self.states.together(rows) > self.states.leeway
+        return outside if self.usual is None or not len(rows) else outside | self.usual.left(rows)
 
     def plain(self) -> dict:
         """Plain containers."""
@@ -130,17 +186,18 @@ class Reach:
             "names": list(self.names), "box": self.box.tolist(), "gravity": self.gravity.tolist(),
             "radius": self.radius, "solids": None if self.solids is None else self.solids.plain(),
             "states": self.states.plain(), "changed": self.changed,
+            "usual": None if self.usual is None else self.usual.plain(),
         }  # fmt: skip
 
     @classmethod
     def read(cls, content: Mapping) -> "Reach":
         """From plain containers."""
-        solids = content["solids"]
+        solids, usual = content["solids"], content["usual"]
         return cls(
             tuple(map(str, content["names"])), np.asarray(content["box"], float).reshape(-1, 2),
             np.asarray(content["gravity"], float), float(content["radius"]),
             None if solids is None else Band.read(solids), Band.read(content["states"]),
-            str(content["changed"]),
+            None if usual is None else Usual.read(usual), str(content["changed"]),
         )  # fmt: skip
 
 

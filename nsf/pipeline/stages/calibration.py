@@ -12,7 +12,7 @@ import torch
 
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Band, Calibration, Reach, Rollout, Trust, rollout_file
+from nsf.deployment import Band, Calibration, Reach, Rollout, Trust, Usual, rollout_file
 from nsf.deployment.bound import rms
 from nsf.kinematics.manifold import Manifold
 from nsf.models.drawn import Drawn
@@ -45,8 +45,15 @@ def calibrated(pipeline, manifold: Manifold) -> Trust:
         trust = Trust.of(manifold, trust.limit, reach)
         trust.unknown = CALIBRATES if at_validation else Trust.unknown
         return trust
+    rollouts = [one for one in rollouts if _tells(one, reach, trust)] or rollouts
     calibration = _calibration(validating, manifold, trust, rollouts)
     return trust.calibrated(reach, [rollout.case.parameters for rollout in rollouts], calibration)
+
+
+def _tells(rollout: Rollout, reach: Reach, trust: Trust) -> bool:
+    """Whether the error of a validation run tells of others: not where it left what was taught."""
+    states = rollout.xhat @ trust.metric
+    return rollout.diverged >= 0 or not reach.of_states(states).any()
 
 
 def _rollouts(validating, manifold: Manifold) -> list[Rollout]:
@@ -89,12 +96,13 @@ def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollou
         )
     else:
         acting, reach = np.stack([run.acting_gravity.at(t) for run in runs]), 0.0
-    solids = np.stack([collider_states(run.solids, scene.dt, scene.steps) for run in runs])
+    solids, usual = np.stack([collider_states(run.solids, scene.dt, scene.steps) for run in runs]), None
     if isinstance(pipeline.model, Drawn) and pipeline.encoding.complete:
         lessons = encoded_runs(pipeline, manifold)
         latents = np.concatenate([latents, lessons.xhat.reshape(-1, latents.shape[1])])
         acting = acting if scene.forcing.gravity else lessons.inputs.gravity
         solids = lessons.inputs.solids
+        usual = Usual.of(lessons.xhat @ trust.metric) if pipeline.forced else None
     gravity = acting.mean((0, 1))
     return Reach(
         names=tuple(manifold.parameter_names),
@@ -103,6 +111,7 @@ def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollou
         radius=reach + float(np.linalg.norm(acting - gravity, axis=-1).max()),
         solids=Band.of_solids(solids, scene.dt) if scene.forcing.colliders else None,
         states=Band.of_states(latents @ trust.metric, [rollout.xhat @ trust.metric for rollout in rollouts]),
+        usual=usual,
         changed=", ".join(pipeline.config.deploy.changes or ()),
     )
 

@@ -54,12 +54,12 @@ def test_a_run_like_the_validation_run_has_its_error_widened():
 
 
 def test_it_is_never_better_than_at_validation_and_grows_with_the_signal():
-    one = calibration([0.1, 0.2], [0.3, 0.6])
+    one = calibration([0.1, 0.2, 0.3], [0.3, 0.6, 0.9])
     assert one.slope == pytest.approx(2.0 / 3.0)
     quiet, loud = (one.bound(T, signal * RAMP, 2.0)[-1] for signal in (0.0, 3.0))
-    assert quiet == pytest.approx(one.factor * 0.2 * RAMP[-1])
+    assert quiet == pytest.approx(one.factor * 0.4 * RAMP[-1])  # 0.2 of 2 m, the middle one
     assert loud == pytest.approx(one.factor * 2.0 * RAMP[-1])
-    assert one.factor == pytest.approx(widening(2))  # signals told all of the difference
+    assert one.factor == pytest.approx(widening(3))  # signals told all of the difference
 
 
 def test_where_signals_tell_nothing_the_largest_error_counts():

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from nsf.deployment import Band, Calibration, Reach, Trust
+from nsf.deployment import Band, Calibration, Reach, Trust, Usual
 from nsf.errors import SchemaError
 from nsf.mpm import Cuboid, Motion
 from nsf.recurrence import collider_states
@@ -102,6 +102,31 @@ def test_states_may_leave_those_of_training_twice_as_far_as_validation_runs_do()
     for others, outside in ((0.0, True), (0.5, False)):
         one = reach(states=Band.of_states(LATENTS, [LATENTS + others * UP]))
         assert one.of_states(far).all() == outside
+
+
+def fallen(count, of=100):
+    """Runs [R, 6, 2] whose states scatter by 0.01 m; some go 1 m aside, each its own way."""
+    runs = np.tile(LATENTS, (of, 1, 1)) + np.random.default_rng(0).normal(0.0, 0.01, (of, 6, 2))
+    angles = np.linspace(0.0, np.pi, count)
+    for run, angle in zip(range(1, 2 * count, 2), angles, strict=True):
+        runs[run] += T[:, None] * [np.cos(angle), 1.0 + np.sin(angle)]
+    return runs
+
+
+def test_a_run_is_usual_that_keeps_as_near_to_others_as_nineteen_of_twenty_do():
+    usual, rare = Usual.of(fallen(1)), LATENTS + T[:, None] * [0.3, 0.7]
+    assert 0.0 < usual.leeway < 0.1
+    assert not usual.left(LATENTS).any()
+    assert usual.left(rare).tolist() == [False] + [True] * 5
+    one = reach(states=Band.of_states(fallen(1).reshape(-1, 2), []), usual=usual)
+    assert one.of_states(rare).any()
+    assert not reach(states=one.states).of_states(rare).any()
+    assert Usual.of(fallen(20)).leeway > 0.5  # two of five other runs fall: that is usual
+
+
+def test_too_few_runs_say_nothing_of_what_is_usual():
+    assert Usual.of(fallen(1)[:37]) is None
+    assert Usual.of(fallen(1)[:38]) is not None
 
 
 def test_a_run_within_what_was_taught_has_the_bound_of_validation():
