@@ -263,7 +263,7 @@ class ReducedMPM:
     def members(self) -> np.ndarray | None:
         """x̂ [M, N + 1, r] of each member of its model up to now, on the host; None of a single one."""
         members = self.span.members(self.steps_taken)
-        return None if members is None else members[:, self.index].double().cpu().numpy()
+        return None if members is None else members[:, self.index].double().numpy()
 
     @property
     def nbytes(self) -> int:

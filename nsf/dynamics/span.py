@@ -73,7 +73,7 @@ class Span(ABC):
         return (changes / setup.dt).to(setup.torch_device, setup.dtype)
 
     def members(self, steps: int) -> torch.Tensor | None:
-        """x̂ [M, B, steps + 1, r] of each member of a model that has several, up to a step; None of others."""
+        """x̂ [M, B, steps + 1, r], on the host, of each member of a model that has several; else None."""
         return None
 
     @property

@@ -187,11 +187,12 @@ class Runs:
         record.row.fill_(end)
 
     def members(self, steps: int) -> Tensor | None:
-        """x̂ [M, B, steps + 1, r] of each member, linear between strides; None where there is one."""
+        """x̂ [M, B, steps + 1, r] of members, on the host, linear between strides; None of a single one."""
         k = self._form.stride
         if self._form.sizes.members == 1:
             return None
-        return _linear(self.loop.xhat[:, :, : -(-steps // k) + 1], k)[:, :, : steps + 1]
+        nodes = self.loop.xhat[:, :, : -(-steps // k) + 1].cpu()  # to launch the rest takes longer
+        return _linear(nodes, k)[:, :, : steps + 1]
 
     @property
     def nbytes(self) -> int:
