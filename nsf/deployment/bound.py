@@ -1,7 +1,7 @@
 """A bound of a run's error with a promise, from runs of validation cases: plain functions of arrays.
 
-A run is never better than the middle one at validation, and worse where a signal of its own, in metres, is
-larger than there. The bound is the least multiple of that which held at validation (conformal prediction):
+A run is never better than validation runs were, and worse where a signal of its own, in metres, is larger
+than there. The bound is the least multiple of that which held at validation (conformal prediction):
 
     bound(t) = factor · max(curve(t) · D, slope · signal(t)),   D: RMS displacement of the run
 
@@ -19,6 +19,9 @@ import numpy as np
 
 #: Share of runs in which a bound holds.
 LEVEL = 0.9
+#: Quantile of validation errors below which no bound is, where programs force a scene, or do not. Runs of
+#: few parameters err alike, so a new one inherits the largest; programs differ, and signals tell how much.
+FLOOR = {True: 0.5, False: 1.0}
 #: Standard deviation of the logarithm of errors of runs of one model: between 0.3 and 0.6 in the committed
 #: reports. Where validation runs are too few for a quantile it says how much wider a bound has to be.
 SCATTER = 0.5
@@ -74,8 +77,8 @@ class Calibration:
     """Errors of validation runs, from which that of a new one is bounded.
 
     Attributes:
-        t: [F] times [s]; curve: [F] their mean shape over time, as large as the middle one
-            of them, as a share of a run's displacement.
+        t: [F] times [s]; curve: [F] their mean shape over time, as large as `floor` of
+            them, as a share of a run's displacement.
         slope: median of error over signal [-].
         factor: on the larger of both, for a bound; typical: likewise, for the error in the middle.
         displacement: RMS over runs [m]; errors: [n] of each run, shares of its displacement.
@@ -93,7 +96,13 @@ class Calibration:
 
     @classmethod
     def of(
-        cls, t: np.ndarray, errors: np.ndarray, moved: np.ndarray, signals: np.ndarray, own: np.ndarray
+        cls,
+        t: np.ndarray,
+        errors: np.ndarray,
+        moved: np.ndarray,
+        signals: np.ndarray,
+        own: np.ndarray,
+        floor: float = 1.0,
     ) -> "Calibration":
         """From n runs at F times, each array [n, F] in m.
 
@@ -102,6 +111,7 @@ class Calibration:
             errors: RMS distance from the full-order run over particles; ∞ of a run that was lost.
             moved: RMS displacement of the full-order run.
             signals: what each run says of itself; own: its RMS displacement.
+            floor: quantile of errors below which no bound is.
         """
         good = np.isfinite(errors).all(1) & np.isfinite(signals).all(1) & np.isfinite(own).all(1)
         errors, moved, signals, own = (values[good] for values in (errors, moved, signals, own))
@@ -115,7 +125,7 @@ class Calibration:
             ratios = shares * size / rms(signals)
         slope = float(np.median(ratios))
         one = cls(
-            t, float(np.median(shares)) * shape, slope if math.isfinite(slope) else 0.0, 1.0, 1.0,
+            t, float(np.quantile(shares, floor)) * shape, slope if math.isfinite(slope) else 0.0, 1.0, 1.0,
             float(np.sqrt(np.mean(size**2))), shares, lost,
         )  # fmt: skip
         expected = [rms(one.bound(t, signal, D)) / D for signal, D in zip(signals, size, strict=True)]

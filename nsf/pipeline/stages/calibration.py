@@ -13,7 +13,7 @@ import torch
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Band, Calibration, Reach, Rollout, Trust, Usual, rollout_file
-from nsf.deployment.bound import rms
+from nsf.deployment.bound import FLOOR, rms
 from nsf.kinematics.manifold import Manifold
 from nsf.models.drawn import Drawn
 from nsf.pipeline.stages.encoding import encoded_runs
@@ -81,7 +81,8 @@ def _calibration(validating, manifold: Manifold, trust: Trust, rollouts: Sequenc
         moved = np.sqrt(np.square(x - X).sum(2).mean(1))
         signal = np.interp(t, rollout.t, rollout.signal)
         rows.append((errors, moved, signal, np.full(len(t), rms(trust.moved(rollout.xhat)))))
-    return Calibration.of(t, *(np.stack(values) for values in zip(*rows, strict=True)))
+    values = (np.stack(values) for values in zip(*rows, strict=True))
+    return Calibration.of(t, *values, floor=FLOOR[validating.forced])
 
 
 def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Reach:

@@ -11,12 +11,12 @@ T = np.linspace(0.0, 1.0, 5)
 RAMP = T / rms(T)
 
 
-def calibration(shares, signals, displacement=2.0, shape=RAMP):
+def calibration(shares, signals, displacement=2.0, shape=RAMP, floor=0.5):
     """Of runs whose errors are shares of one displacement."""
     with np.errstate(invalid="ignore"):
         errors, signals = (np.outer(values, shape) for values in (displacement * np.array(shares), signals))
     moved = np.full(errors.shape, displacement)
-    return Calibration.of(T, errors, moved, signals, moved)
+    return Calibration.of(T, errors, moved, signals, moved, floor)
 
 
 def test_one_score_is_widened_by_the_quantile_of_a_difference():
@@ -60,6 +60,12 @@ def test_it_is_never_better_than_at_validation_and_grows_with_the_signal():
     assert quiet == pytest.approx(one.factor * 0.4 * RAMP[-1])  # 0.2 of 2 m, the middle one
     assert loud == pytest.approx(one.factor * 2.0 * RAMP[-1])
     assert one.factor == pytest.approx(widening(3))  # signals told all of the difference
+
+
+def test_a_family_of_parameters_inherits_the_largest_error():
+    one = calibration([0.1, 0.4], [0.3, 0.3], floor=1.0)
+    assert rms(one.bound(T, 0.0 * RAMP, 2.0)) / 2.0 == pytest.approx(widening(2) * 0.4)
+    assert one.typical == pytest.approx(0.5 * (0.25 + 1.0))  # of the errors over the largest
 
 
 def test_where_signals_tell_nothing_the_largest_error_counts():
