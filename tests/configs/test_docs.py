@@ -130,6 +130,18 @@ def test_page(page, project, monkeypatch, capsys):
             raise
 
 
+#: Text right after a row of a table; an item or a row right after text that is no item.
+_JOINED = re.compile(r"^\|.*\n(?!\||<!--)\S.*|^(?!\d+\. )[^\s#|<>*-].*\n(?:[-*] |\d+\. |\|).*", re.MULTILINE)
+
+
+def test_tables_and_lists_stand_apart():
+    """Without a blank line above it, the site shows a list as part of the table or the paragraph above."""
+    for page in (*DOCS.glob("**/*.md"), *ROOT.glob("*.md"), *ROOT.glob("reports/**/*.md")):
+        prose = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        joined = _JOINED.findall(prose)
+        assert not joined, f"{page}: a blank line is missing in {joined}"
+
+
 def test_named_paths_are_there():
     """A path of the repository that a page names, unless the page adds it or a command makes it."""
     for page in (*PAGES, "design.md"):
