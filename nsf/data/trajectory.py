@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from nsf.data import hdf5
+from nsf.data import hdf5, schema
 from nsf.data.schema import COMPONENTS, FORCING, SCHEMA_VERSION, TAU_ORDER, UNITS, hash_of_positions, packed
 from nsf.data.sink import Sink
 from nsf.errors import ConfigError, InstabilityError, SchemaError, ShapeError
@@ -235,6 +235,11 @@ class Trajectory:
             hdf5.reading(path, "trajectory", "simulate"),
         ):
             return cls(Path(path), file)
+
+    @classmethod
+    def of(cls, run: Any) -> "Trajectory":
+        """Open that of a simulate run, as `open` does; the run has files by name, as `nsf.runs.Run`."""
+        return cls.open(run.file(schema.TRAJECTORY))
 
     def read(
         self, field: str, frames: Any = slice(None), particles: Any = None, out: np.ndarray | None = None

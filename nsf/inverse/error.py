@@ -7,7 +7,6 @@ import torch
 from scipy.optimize import brentq
 
 from nsf.data import PROGRAM, Trajectory
-from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError
 from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import View
@@ -56,7 +55,7 @@ class ModelError:
             seen = view.of_runs(model(parameters, forcing)).cpu().numpy()
         truths = []
         for case in cases:
-            with Trajectory.open(pipeline.simulation(case).file(TRAJECTORY)) as trajectory:
+            with Trajectory.of(pipeline.simulation(case)) as trajectory:
                 truths.append(view.of_truth(trajectory))
         return cls(parameters, np.array(truths) - seen, forcing)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from nsf.data import PROGRAM, Case, Trajectory
-from nsf.data.schema import TRAJECTORY
 from nsf.inverse.fit import Fit, fit
 from nsf.inverse.model import Model
 from nsf.inverse.observations import Observations, View
@@ -73,7 +72,7 @@ def run(model: Model, trials: Trials, say: Callable[[str], object] = print) -> t
     say(f"calibrate: full-order runs of {len(cases)} trials of {model.scene.name}")
     runs, rows, fits = model.pipeline.full_order(cases), [], []
     for trial, (case, simulated) in enumerate(zip(cases, runs, strict=True)):
-        with Trajectory.open(simulated.file(TRAJECTORY)) as truth:
+        with Trajectory.of(simulated) as truth:
             seen = trials.observed(model, truth, trial)
         began = time.perf_counter()
         forcing = model.forcing(case.parameters, int(case[PROGRAM])) if PROGRAM in case else None

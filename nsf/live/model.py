@@ -11,7 +11,7 @@ import torch
 
 from nsf.bodies.colors import CLIP
 from nsf.data import Case, Trajectory
-from nsf.data.schema import TRAJECTORY, packed
+from nsf.data.schema import packed
 from nsf.deployment import TRUST, Trust, Verdict
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
@@ -303,7 +303,7 @@ class LiveModel:
     def truth(self, case: Case) -> Truth | None:
         """The full-order run of a known case; None of other cases."""
         run = self.truth_run(case)
-        return Truth(Trajectory.open(run.file(TRAJECTORY)), self.shown) if run else None
+        return Truth(Trajectory.of(run), self.shown) if run else None
 
     @property
     def floor(self) -> float | None:

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from nsf.data import Case
-from nsf.data.schema import TRAJECTORY
 from nsf.data.trajectory import Trajectory
 from nsf.errors import ConfigError
 from nsf.evaluation.metrics import von_mises
@@ -282,7 +281,7 @@ def _recorded(
     most = min(sizes.points, len(model.shown))
     chosen = np.sort(np.random.default_rng(1).permutation(len(model.shown))[:most])
     particles = model.shown[chosen]
-    with Trajectory.open(model.truth_run(case).file(TRAJECTORY)) as trajectory:
+    with Trajectory.of(model.truth_run(case)) as trajectory:
         frames = spaced(trajectory.frames, sizes.frames + 1)
         x = trajectory.read("x", frames=frames.tolist(), particles=particles)
         tau = trajectory.read("tau", frames=frames.tolist(), particles=particles)

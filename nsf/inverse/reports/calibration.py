@@ -7,7 +7,6 @@ import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.data.schema import TRAJECTORY
 from nsf.deployment.trust import bound_text, percent
 from nsf.inverse.fit import CONFIDENCE, Fit, fit
 from nsf.inverse.model import Model
@@ -71,7 +70,7 @@ def calibration(
     if full_order:
         estimate = dict(zip(space.free, best.estimate.tolist(), strict=True))
         runs = problem.full_order([estimate | dict(space.fixed)])
-        with Trajectory.open(runs[0].file(TRAJECTORY)) as truth:
+        with Trajectory.of(runs[0]) as truth:
             rows["full_order"] = view.of_truth(truth)
         off = 1e3 * rms(rows["value"] - rows["full_order"])
         say(f"calibrate: a full-order run at the estimate leaves {off:.3g} mm (RMS) → {runs[0].id}")

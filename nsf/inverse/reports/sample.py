@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 
 from nsf.data import Trajectory
-from nsf.data.schema import TRAJECTORY
 from nsf.inverse.fit import fit
 from nsf.inverse.observations import View
 from nsf.inverse.posterior import Posterior, posterior
@@ -121,7 +120,7 @@ def _indices(
         simulated.extend(problem.full_order(rows))
         seen = []
         for run in simulated:
-            with Trajectory.open(run.file(TRAJECTORY)) as truth:
+            with Trajectory.of(run) as truth:
                 seen.append(scalars.of_truth(truth))
         return np.array(seen)
 

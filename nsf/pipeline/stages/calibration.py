@@ -4,14 +4,12 @@ These runs are a deployment of their own, made once for a model and used again. 
 hundred particles and some fifty frames.
 """
 
-import contextlib
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from nsf.data import Case, Trajectory
-from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Band, Calibration, Reach, Rollout, Trust, Usual, rollout_file
 from nsf.deployment.bound import FLOOR, rms
 from nsf.kinematics.manifold import Manifold
@@ -38,7 +36,7 @@ def calibrated(pipeline, manifold: Manifold) -> Trust:
     """
     trust = Trust.of(manifold, 0.01 * pipeline.config.trust.limit)
     validating = pipeline.validating
-    rollouts = [] if validating is None else _rollouts(validating, manifold)
+    rollouts = [] if validating is None else rollouts_of(validating, manifold)
     reach = _reach(pipeline, manifold, trust, rollouts)
     if not rollouts:
         at_validation = pipeline.config.deploy.split == "validation"
@@ -56,8 +54,13 @@ def _tells(rollout: Rollout, reach: Reach, trust: Trust) -> bool:
     return rollout.diverged >= 0 or not reach.of_states(states).any()
 
 
-def _rollouts(validating, manifold: Manifold) -> list[Rollout]:
-    run, count = validating.deployment.require(), len(validating.held_out)
+def rollouts_of(pipeline, manifold: Manifold) -> list[Rollout]:
+    """The reduced runs of a pipeline's held-out cases.
+
+    Raises:
+        MissingRunError: they are not deployed.
+    """
+    run, count = pipeline.deployment.require(), len(pipeline.held_out)
     return [Rollout.open(run.file(rollout_file(index)), manifold.latent_dim) for index in range(count)]
 
 
@@ -65,9 +68,7 @@ def _calibration(validating, manifold: Manifold, trust: Trust, rollouts: Sequenc
     """Errors of runs of validation cases, beside what these runs say of themselves."""
     (particles, at), rows = manifold.at_some(), []
     for rollout in rollouts:
-        with contextlib.closing(
-            Trajectory.open(validating.truth(rollout.case).require().file(TRAJECTORY))
-        ) as truth:
+        with Trajectory.of(validating.truth(rollout.case).require()) as truth:
             frames = spaced(truth.frames, _FRAMES)
             t = truth.t[frames]
             x = truth.read("x", frames=frames.tolist(), particles=particles)

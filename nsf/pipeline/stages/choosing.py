@@ -1,15 +1,12 @@
 """The choice of `model=auto`: each candidate by itself at the validation cases."""
 
-import contextlib
-
 import numpy as np
 
 from nsf.data import Trajectory
-from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError
 from nsf.evaluation import compare
 from nsf.models.auto import Measured
+from nsf.pipeline.stages.calibration import rollouts_of
 
 #: Pictures are not asked for here.
 _SHOWN = (1, 2)
@@ -49,11 +46,10 @@ def _measured(pipeline, name: str) -> Measured:
         alone = pipeline.alone(name).check()
     except ConfigError as error:
         return Measured(name, refused=str(error))
-    run, manifold = alone.deploy(), alone.manifold().to(alone.device)
-    errors, seconds = [], []
-    for index, case in enumerate(alone.held_out):
-        rollout = Rollout.open(run.file(rollout_file(index)), manifold.latent_dim)
-        with contextlib.closing(Trajectory.open(alone.truth(case).require().file(TRAJECTORY))) as truth:
+    alone.deploy()
+    manifold, errors, seconds = alone.manifold().to(alone.device), [], []
+    for case, rollout in zip(alone.held_out, rollouts_of(alone, manifold), strict=True):
+        with Trajectory.of(alone.truth(case).require()) as truth:
             solver = alone.solver_at(manifold, case)
             errors.append(compare(solver, truth, rollout, "validation", _SHOWN).displacement_error)
         seconds.append(rollout.seconds)

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from nsf.data import Case, Trajectory
-from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.kinematics.manifold import Manifold
 from nsf.models.inputs import Lessons
@@ -127,7 +126,7 @@ def encoded_validation(pipeline, manifold: Manifold) -> Lessons:
     """Likewise of the full-order runs by which a model is chosen, none of them held out."""
     encoder, pairs = encoder_of(pipeline, manifold), []
     for case in pipeline.lessons[2]:
-        with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
+        with Trajectory.of(pipeline.simulation(case).require()) as trajectory:
             run = encoded_trajectory(trajectory, encoder, pipeline.device) if trajectory.every == 1 else None
         if run is None:  # not every step is stored
             solver = pipeline.scene.full_order(case, pipeline.config.precision, pipeline.device)
@@ -159,7 +158,7 @@ def _encoded(pipeline, encoder: Encoder, lessons: Sequence[Lesson], record: Reco
             if intact(path, pipeline.say):
                 progress.advance(steps)
             elif each_step and lesson.case in training and stored.complete:
-                with Trajectory.open(stored.file(TRAJECTORY)) as trajectory:
+                with Trajectory.of(stored) as trajectory:
                     encoded_trajectory(trajectory, encoder, pipeline.device).save(path)
                 progress.advance(steps)
             else:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import FULL_ORDER, PROJECTED, TRUST, Rollout, Trust, continuation_file, rollout_file
+from nsf.deployment import FULL_ORDER, PROJECTED, TRUST, Rollout, Trust, continuation_file
 from nsf.dynamics.setup import reduced_steps
 from nsf.errors import SchemaError
 from nsf.evaluation import (
@@ -23,7 +23,7 @@ from nsf.evaluation import (
 )
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
-from nsf.pipeline.stages.calibration import beyond
+from nsf.pipeline.stages.calibration import beyond, rollouts_of
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.vectors import spaced
@@ -48,7 +48,7 @@ def evaluate(pipeline, run: Run) -> None:
     """
     truths, manifold = _truths(pipeline), pipeline.manifold().to(pipeline.device)  # as in deployment
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
-        rollouts = _rollouts(pipeline, manifold)
+        rollouts = rollouts_of(pipeline, manifold)
         frames, coarse = pipeline.deployed.steps // pipeline.config.data.every + 1, len(pipeline.coarse)
         total = len(rollouts) * ((2 + coarse) * frames - 1)  # rivals are not compared in the first
         with Progress("evaluate", total, "frames") as progress:
@@ -83,7 +83,7 @@ def superresolve_held_out(pipeline, run: Run) -> None:
     # Evenly spread, without frame 0, at which nothing has moved.
     frames = spaced(steps // c.data.every + 1, keys.frames + 1)[1:]
     with run.record(device=pipeline.device, precision=c.precision) as record:
-        rollouts = _rollouts(pipeline, manifold)
+        rollouts = rollouts_of(pipeline, manifold)
         with contextlib.ExitStack() as files:
             fine = superresolve(
                 manifold,
@@ -112,12 +112,6 @@ def superresolve_held_out(pipeline, run: Run) -> None:
 def _truths(pipeline) -> list[Path]:
     """Files of the full-order trajectories that the deployed ones are held to."""
     return [pipeline.truth(case).file(TRAJECTORY) for case in pipeline.held_out]
-
-
-def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
-    """The reduced runs of the held-out cases."""
-    files = (pipeline.deployment.file(rollout_file(index)) for index in range(len(pipeline.held_out)))
-    return [Rollout.open(file, manifold.latent_dim) for file in files]
 
 
 def _beyond(pipeline, manifold: Manifold, rollouts, comparisons: Sequence[Comparison]) -> list[int]:

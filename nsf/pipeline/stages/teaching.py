@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from nsf.data import Trajectory, archives
-from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError
 from nsf.kinematics.manifold import Manifold
 from nsf.models import Recurrence
@@ -138,7 +137,7 @@ def _yardstick(pipeline, manifold: Manifold, lessons: Lessons) -> Yardstick:
     together = math.lcm(stride, stored)  # steps between frames that are stored and end a stride
     apart = together * max(1, steps // together // _FRAMES)
     for case in pipeline.lessons[2]:
-        with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
+        with Trajectory.of(pipeline.simulation(case).require()) as trajectory:
             frames = list(range(0, trajectory.frames, apart // stored))
             truth.append(torch.as_tensor(trajectory.read("x", frames=frames, particles=particles)))
 

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from PIL import Image
 
 from nsf.data import Trajectory, archives
-from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
 from nsf.results.formats import HTML
 from nsf.results.overview.tables import Column, columns
@@ -99,7 +98,7 @@ def thumbnail(run: Run, path: Path) -> bool:
 
 def _simulated(ax: Axes, run: Run) -> None:
     """The particles at the end."""
-    with Trajectory.open(run.file(TRAJECTORY)) as trajectory:
+    with Trajectory.of(run) as trajectory:
         step = max(1, trajectory.particles // _POINTS)
         x = trajectory.read("x", trajectory.frames - 1, slice(None, None, step)).reshape(-1, 3)
     _scatter(ax, x, FULL)
