@@ -27,9 +27,8 @@ _LISTED = 8  # runs that an error names
 class Run:
     """One stage of one scene under one configuration: `root/stage/scene/hash`.
 
-    Two runs are equal when they are the same folder. Make one with `open`
-    (from a configuration), `load` (from an id), `named` (from what a user types), `newest` or `find` (every
-    one there is).
+    Two runs are equal when they are the same folder. Make one with `open` (from a configuration), `named`
+    (from what a user types), `newest` or `find` (every one there is).
     """
 
     stage: str
@@ -67,20 +66,6 @@ class Run:
         settings = plain(config)
         ids = tuple(parent.id for parent in parents)
         return cls(stage, scene, _hash_of(stage, scene, settings, ids), _root(root), settings, ids)
-
-    @classmethod
-    def load(cls, run_id: str, root: str | Path | None = None) -> "Run":
-        """The recorded run called `stage/scene/hash`.
-
-        Raises:
-            MissingRunError: no such run was ever started.
-        """
-        names = run_id.split("/")
-        if not _is_run(names) or not (_root(root) / run_id / MANIFEST).is_file():
-            raise MissingRunError(
-                f"no run {run_id!r} under {_root(root)}; run its stage first, or set NSF_RUNS"
-            )
-        return cls(*names, _root(root))
 
     @classmethod
     def find(

@@ -275,7 +275,7 @@ def test_a_link_on_the_way_to_a_file_is_refused(tmp_path):
 
 def test_a_folder_of_runs_may_be_a_link(runs, tmp_path):
     (tmp_path / "link").symlink_to(tmp_path)
-    run = Run.load(runs[0].id, tmp_path / "link")
+    run = Run.named(runs[0].id, root=tmp_path / "link")
     assert run.require().file("data.bin").read_text() == "payload"
 
 

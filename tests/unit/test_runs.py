@@ -104,14 +104,14 @@ def test_packages_without_metadata_are_recorded_as_such(run, monkeypatch):
     monkeypatch.setattr(nsf.runs.provenance, "_version", lambda distribution: None)
     monkeypatch.setattr(nsf.runs.run, "provenance", nsf.runs.provenance.provenance.__wrapped__)
     recorded(run)
-    assert Run.load(run.id, root=run.root).manifest["versions"]["numpy"] is None
+    assert Run.named(run.id, root=run.root).manifest["versions"]["numpy"] is None
 
 
 def test_the_config_on_disk_is_plain_and_the_same(run):
     recorded(run)
     text = (run.path / "config.yaml").read_text()
     assert yaml.safe_load(text)["nested"] == CONFIG["nested"]
-    loaded = Run.load(run.id, root=run.root)
+    loaded = Run.named(run.id, root=run.root)
     assert loaded == run
     assert loaded.config == CONFIG
     assert isinstance(loaded.config["name"], str)
@@ -242,12 +242,6 @@ def test_find_is_newest_first_and_by_scene(tmp_path):
     assert Run.find("train", root=tmp_path) == [jelly, *runs[::-1]]
     assert Run.find("deploy", root=tmp_path) == []
     assert Run.find("train", "jelly", root=tmp_path)[0].config == {"r": 1}
-
-
-def test_load_of_a_run_that_is_not_there(tmp_path):
-    for run_id in ("train/sand/0123456789ab", "train", ""):
-        with pytest.raises(MissingRunError, match="NSF_RUNS"):
-            Run.load(run_id, root=tmp_path)
 
 
 def test_outputs_must_lie_in_the_run(run, tmp_path):

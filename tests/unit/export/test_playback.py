@@ -84,7 +84,7 @@ def spoiled(run, tmp_path, seal, **changes):
     """A copy of the tiny chain's runs whose rollout is another."""
     root = tmp_path / "runs"
     shutil.copytree(run.root, root)
-    copy = Run.load(run.id, root)
+    copy = Run.named(run.id, root=root)
     path = copy.path / "rollout_0.h5"
     rollout = replace(Rollout.open(path), **changes)
     rollout.save(path)
@@ -118,7 +118,7 @@ def test_a_run_by_the_full_order_solver_is_its_frames(deployed, chain, tmp_path,
 def test_the_run_and_its_training_are_enough(deployed, tmp_path):
     shutil.copytree(deployed.root, tmp_path / "runs")
     shutil.rmtree(tmp_path / "runs/simulate")
-    run = Run.load(deployed.id, tmp_path / "runs")
+    run = Run.named(deployed.id, root=tmp_path / "runs")
     for points in (100, 600):
         assert len(whole(Playback(run, points=points, device="cpu"))[0]) == 25
     shutil.rmtree(tmp_path / "runs/train")
