@@ -123,10 +123,10 @@ def test_a_bomb(tmp_path, line, short):
 
 
 @pytest.mark.parametrize("pack", [bz2.compress, lambda data: zipped(data), gzip.compress])
-def test_compression_is_named(tmp_path, pack):
+def test_packed_text_is_refused_but_for_gzip(tmp_path, pack):
     path = tmp_path / "seen.csv"
     path.write_bytes(pack(CSV.encode()))
-    refused(path, {b"BZ": "bzip2", b"PK": "zip", b"\x1f\x8b": "gzip"}[path.read_bytes()[:2]], "csv.gz")
+    refused(path, "no UTF-8 text", "csv.gz")
 
 
 def zipped(data):
