@@ -50,7 +50,7 @@ class Column:
     def cell(self, value) -> str:
         """A value of the table as shown."""
         if self.text:
-            return ABSENT if _is_missing(value) or value == "" else brief(str(value))
+            return ABSENT if is_empty(value) else brief(str(value))
         return number(value, self.scale)
 
 
@@ -102,7 +102,7 @@ def number(value, scale: float = 1.0) -> str:
     """A value with three significant digits (integers and text in full); `–` where nothing was measured."""
     if isinstance(value, str):
         return value
-    if _is_missing(value):
+    if is_empty(value):
         return ABSENT
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
@@ -145,5 +145,6 @@ def model_name(row: Mapping) -> str:
     return name
 
 
-def _is_missing(value) -> bool:
-    return value is None or (isinstance(value, float) and math.isnan(value))
+def is_empty(value) -> bool:
+    """Whether a cell of a table holds nothing."""
+    return value is None or value == "" or (isinstance(value, float) and math.isnan(value))

@@ -26,6 +26,7 @@ from nsf.results.columns import (
     TEXT,
     brief,
     column,
+    is_empty,
     model_name,
     number,
     plus_minus,
@@ -231,7 +232,7 @@ def variants(frame: pd.DataFrame, without: Iterable[str] = ()) -> list[str]:
         return frame["model_name"].to_list()
     names = frame["model_name"] if "model_name" in keys else pd.Series("", frame.index)
     parts = [
-        [name, *(_named(key, value) for key, value in row.items() if not _is_empty(value))]
+        [name, *(_named(key, value) for key, value in row.items() if not is_empty(value))]
         for name, row in zip(names, shown.to_dict("records"), strict=True)
     ]
     return [" · ".join(filter(None, part)) or "default" for part in parts]
@@ -337,13 +338,13 @@ def constants(frame: pd.DataFrame, names: Iterable[str]) -> dict[str, str]:
     return {
         column(name).title: f"{column(name).cell(value)} {column(name).unit}".strip()
         for name, value in values.items()
-        if not _is_empty(value)
+        if not is_empty(value)
     }
 
 
 def rows_of(frame: pd.DataFrame, names: Sequence[str]) -> Rows:
     """Columns of a frame as text with units in the headings, those with nothing in them left out."""
-    shown = [name for name in names if name in frame and not frame[name].map(_is_empty).all()]
+    shown = [name for name in names if name in frame and not frame[name].map(is_empty).all()]
     body = [[_cell(name, row) for name in shown] for row in frame.to_dict("records")]
     headings = [column(name).heading for name in shown]
     return Rows(headings, body, [not column(name).text for name in shown])
@@ -386,7 +387,7 @@ def parameter(case: str) -> tuple[str, str]:
 
 def natural(value) -> tuple:
     """Sort key: numbers by size, then text with the numbers in it by size; held-out splits first."""
-    if _is_empty(value):
+    if is_empty(value):
         return (0, 0.0, "")
     if isinstance(value, int | float):
         return (1, float(value), "")
@@ -433,7 +434,7 @@ def _named(key: str, value) -> str:
 def _cell(name: str, row: Mapping) -> str:
     if f"{name}{DEVIATION}" in row:
         return plus_minus(row[name], row[f"{name}{DEVIATION}"], column(name).scale)
-    return ABSENT if _is_empty(row[name]) else column(name).cell(row[name])
+    return ABSENT if is_empty(row[name]) else column(name).cell(row[name])
 
 
 def _only(values: pd.Series):
@@ -443,7 +444,3 @@ def _only(values: pd.Series):
 
 def _percent(value: float) -> str:
     return f"{number(value, 100)} %" if math.isfinite(value) else "∞"
-
-
-def _is_empty(value) -> bool:
-    return value is None or value == "" or (isinstance(value, float) and math.isnan(value))
