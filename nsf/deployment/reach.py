@@ -192,7 +192,7 @@ class Reach:
     @classmethod
     def read(cls, content: Mapping) -> "Reach":
         """From plain containers."""
-        solids, usual = content["solids"], content["usual"]
+        solids, usual = content["solids"], content.get("usual")
         return cls(
             tuple(map(str, content["names"])), np.asarray(content["box"], float).reshape(-1, 2),
             np.asarray(content["gravity"], float), float(content["radius"]),
