@@ -178,7 +178,11 @@ def _mlflow(run: Run, folder: Path, group: str) -> Tool:
             made = [] if runs else [client.create_run(experiment, tags={"nsf": name, **tags}, run_name=title)]
             return (runs or made)[0].info.run_id, bool(made)
 
-        of = {"mlflow.parentRunId": begun(group, group)[0]} if group else {}
+        of = {}
+        if group:
+            of["mlflow.parentRunId"], made = begun(group, group)
+            if made:
+                client.set_terminated(of["mlflow.parentRunId"])  # it has no work of its own
         run_id, new = begun(run.id, run.hash, **of)
     logger = MLFlowLogger(experiment_name=run.scene, tracking_uri=uri, run_id=run_id)
     return Tool(
