@@ -33,7 +33,7 @@ def test_a_failure_crosses_from_another_process(copied, tiny, monkeypatch):
     assert "exceeds the 8 displacement modes" in runs[9].manifest["error"]
 
 
-def dies_at(config, stages, seed, labels=()):
+def dies_at(config, stages, seed, labels=(), group=""):
     if config.seed == seed:
         os.kill(os.getpid(), signal.SIGKILL)
 
