@@ -100,7 +100,7 @@ def test_bad_row_is_named(bad):
 
 
 def test_bad_precision_and_device():
-    with pytest.raises(ConfigError, match="precision='fp8'"):
+    with pytest.raises(ConfigError, match="precision=fp8"):
         drive(Hencky(1.0, 0.3), EYE, 1.0, precision="fp8")
     with pytest.raises(DeviceError, match="device=tpu"):
         drive(Hencky(1.0, 0.3), EYE, 1.0, device="tpu")
@@ -142,7 +142,7 @@ def test_cyclic_shear_returns():
 @pytest.mark.parametrize(
     ("arguments", "quoted"),
     [
-        (("twist", 0.1, 5), "path='twist'"),
+        (("twist", 0.1, 5), "path=twist"),
         (("simple_shear", 0.0, 5), "amplitude=0.0"),
         (("oedometer", 1.0, 5), "amplitude=1.0"),
         (("simple_shear", 0.1, 1), "points=1"),

@@ -84,8 +84,8 @@ REFUSED = [
     (lambda: DomainWalls("slip", 0), "walls.padding=0"),
     (lambda: GridGeometry.of_domain((1.0, 1.0, 1.0), 0.0), "dx=0.0 m"),
     (lambda: GridGeometry.of_domain((1.0, 1.0, 0.5), 0.1), "dx=0.1 m leaves 5 cells"),
-    (lambda: precision_of("half"), "precision='half'"),
-    (lambda: shape_functions(FP64, "linear"), "shape='linear'"),
+    (lambda: precision_of("half"), "precision=half"),
+    (lambda: shape_functions(FP64, "linear"), "shape=linear"),
 ]
 
 
