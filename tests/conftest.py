@@ -50,6 +50,14 @@ def one_thread_for_torch():
 
 
 @pytest.fixture(scope="session", autouse=True)
+def no_width():
+    """Workers side by side have a width of 80, which tables would be cut to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("COLUMNS", raising=False)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def garbage_stays():
     """Costs are measured after collections of garbage, which only the memory of a GPU needs."""
     from nsf.evaluation import cost
