@@ -76,7 +76,8 @@ def error_bounds(view: View) -> Figures:
     for i, (body, part) in enumerate(rows.groupby("body", sort=False)):
         errors = np.clip(100 * part["displacement_error"], ends[0], ends[1])
         style = {"color": PALETTE[i % len(PALETTE)], "label": body, "alpha": 0.7}
-        beside.plot(np.minimum(100 * part["error_bound"], ends[1]), errors, "o", ms=3.5, mew=0, **style)
+        marker = "o^sD"[i // len(PALETTE) % 4]  # a colour comes again where there are many bodies
+        beside.plot(np.minimum(100 * part["error_bound"], ends[1]), errors, marker, ms=3.5, mew=0, **style)
     beside.plot(ends, ends, color=INK, lw=1.0)
     beside.set(xscale="log", yscale="log", xlabel=COLUMNS["error_bound"].heading, ylabel=ERROR)
     beside.set(xlim=ends, ylim=ends)
