@@ -76,40 +76,20 @@ TOOLS = {
 }
 _EXAMPLES = """\
 examples:
+  nsf init FOLDER mesh=FILE unit=mm
+      a project around your own mesh, law and forcing: begin here for your own
+  nsf demo
+      a model in the browser, at once
   nsf run scene=sand scale=small
       the paper's method in a minute or two, on a CPU
   nsf run scene=sand stress=deformation affine=none
       the baseline beside it, in the same report
-  nsf run scene=sand scene.design.test=[23,30.5]
-      other held-out cases
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150
       every combination
-  nsf plan scene=cake scale=paper
-      what that would take, before it begins
-  nsf run +experiment=table1/scenes scale=small
-      the jobs of a part of an experiment, and its report
   nsf run -m +experiment=timestep hydra/launcher=joblib
-      jobs side by side on this machine
-  nsf run -m +experiment=table1 hydra/launcher=slurm
-      jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
-  nsf demo
-      a model in the browser, at once
-  nsf export --html --frames
-      the newest deployed run as a page and a film
-  nsf point material=drucker_prager path=oedometer
-      plot a law before trusting it
-  nsf run --config-dir my/conf scene=mine
-      groups of a folder of yours, before these
-  nsf view
-      the newest deployment in the browser
-  nsf search scene=sand scene.design.validation=[27,31] latent_dim=4..8
-      the r of the smallest error there
-  nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta
+      the jobs of an experiment side by side, and their report
+  nsf runs stage=evaluate scene=sand sort=displacement_error
       runs by what made them, the best first
-  nsf runs diff 1a2b 3c4d
-      what differs between two runs, in keys and in result
-  nsf bench particles=10k,40k precision=fp32
-      what a step costs on this machine, and its floor
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS). Every command
 takes --config-dir DIR, or NSF_CONFIG=DIR: a folder with groups of yours, as

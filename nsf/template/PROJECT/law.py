@@ -15,5 +15,5 @@ class Law(IsotropicHardening):
     rate: float  # [-]
 
     def flow_stress(self, gamma):
-        """Largest ‖dev τ‖ [Pa] at the plastic strain γ; write a number as `type(gamma)(2.0)`."""
+        """Largest ‖dev τ‖ [Pa] at the plastic strain γ; a number alone takes its type: `type(gamma)(2.0)`."""
         return self.saturation + (self.yield_stress - self.saturation) * math.exp(-self.rate * gamma)

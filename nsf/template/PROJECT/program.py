@@ -23,5 +23,5 @@ class Program(GravityProgram):
         return Gravity(t.tolist(), (gravity.at(t) + change).tolist())
 
     def reach(self, gravity: float) -> float:
-        """Largest size of a change [m/s²]."""
+        """Largest size of `change` in any run [m/s²]: gravity further off is beyond what was taught."""
         return self.amplitude
