@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from nsf.recurrence.solids import FEATURES
-from nsf.vectors import drawn, spaced
+from nsf.vectors import drawn
 
 #: Of a value: what float32 may have moved it by.
 _ROUND_OFF = 1e-6
@@ -16,8 +16,10 @@ _ROUND_OFF = 1e-6
 _AGAIN = 2.0
 #: Of the size of the ranges of latent states: what a run may leave them by, at least and at most.
 _LEAST, _MOST = 0.1, 1.0
-#: Share of runs that are usual, states of theirs by which others are judged, and frames of a run looked at.
-_USUAL, _ROWS, _FRAMES = 0.95, 2048, 64
+#: Share of runs that are usual.
+_USUAL = 0.95
+#: States of runs by which others are judged, at most, and frames of a run that are looked at, about.
+_ROWS, _FRAMES = 1024, 64
 
 
 @dataclass(frozen=True)
@@ -92,38 +94,42 @@ class Usual:
 
     Attributes:
         rows: [K, r] [m] states of half of the runs.
-        leeway: [m] from the nearest of these, at any time, of `_USUAL` of the other half.
+        leeway: distance [m] to the nearest of these that 95 % of the other half never pass.
+        every: steps from one frame that is looked at to the next.
     """
 
     rows: np.ndarray
     leeway: float
+    every: int = 1
 
     @classmethod
     def of(cls, runs: np.ndarray) -> "Usual | None":
         """Of latent states [R, N + 1, r] [m] of runs; None of too few to say what is usual."""
-        frames = runs[:, spaced(runs.shape[1], _FRAMES)]
+        every = max(1, runs.shape[1] // _FRAMES)
+        frames = runs[:, ::every]
         judges, others = frames[::2].reshape(-1, frames.shape[2]), frames[1::2]
         rank = math.ceil((len(others) + 1) * _USUAL - 1e-9)
         if rank > len(others):
             return None
         rows = judges[drawn(len(judges), _ROWS)]
         farthest = np.sort([_nearest(one, rows).max() for one in others])
-        return cls(rows, float(farthest[rank - 1]))
+        return cls(rows, float(farthest[rank - 1]), every)
 
-    def left(self, rows: np.ndarray) -> np.ndarray:
-        """[N] whether a run with states [N, r] [m] is further off, at some of its frames; False at others."""
-        frames, far = spaced(len(rows), _FRAMES), np.zeros(len(rows), bool)
-        far[frames] = _nearest(rows[frames], self.rows) > self.leeway
+    def left(self, rows: np.ndarray, every: int) -> np.ndarray:
+        """[N] whether a run with states [N, r] [m] is further off, at each `every`-th; False at others."""
+        far = np.zeros(len(rows), bool)
+        far[::every] = _nearest(rows[::every], self.rows) > self.leeway
         return far
 
     def plain(self) -> dict:
         """Plain containers."""
-        return {"rows": np.float32(self.rows).tolist(), "leeway": self.leeway}
+        rows = [[float(f"{value:.5g}") for value in row] for row in self.rows]  # a page has them
+        return {"rows": rows, "leeway": self.leeway, "every": self.every}
 
     @classmethod
     def read(cls, content: Mapping) -> "Usual":
         """From plain containers."""
-        return cls(np.asarray(content["rows"], float), float(content["leeway"]))
+        return cls(np.asarray(content["rows"], float), float(content["leeway"]), int(content["every"]))
 
 
 def _nearest(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -175,10 +181,17 @@ class Reach:
             return "a solid is where, or as fast as, no program of training moves it"
         return ""
 
-    def of_states(self, rows: np.ndarray) -> np.ndarray:
-        """[N] whether latent states [N, r] [m] of a run are outside, or no usual ones."""
+    def of_states(self, rows: np.ndarray, every: int | None = None) -> np.ndarray:
+        """[N] whether latent states of a run are outside, or no usual ones.
+
+        Args:
+            rows: [N, r] [m].
+            every: of these are looked at for being usual; None: as many as lie between frames of teaching.
+        """
         outside = self.states.together(rows) > self.states.leeway
-        return outside if self.usual is None or not len(rows) else outside | self.usual.left(rows)
+        if self.usual is None or not len(rows):
+            return outside
+        return outside | self.usual.left(rows, every or self.usual.every)
 
     def plain(self) -> dict:
         """Plain containers."""

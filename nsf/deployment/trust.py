@@ -32,9 +32,10 @@ _AWAY = 0.5
 
 
 _BAND = {"low": [float], "high": [float], "leeway": float}
+_USUAL = {"rows": [[float]], "leeway": float, "every": schemas.Number(1, whole=True)}
 _REACH = {
     "names": [str], "box": [[float]], "gravity": [float], "radius": float, "solids": (_BAND, None),
-    "states": _BAND, schemas.Maybe("usual"): ({"rows": [[float]], "leeway": float}, None), "changed": str,
+    "states": _BAND, schemas.Maybe("usual"): (_USUAL, None), "changed": str,
 }  # fmt: skip
 _CALIBRATION = {
     "t": [float], "curve": [float], "slope": float, "factor": (float, None), "typical": (float, None),

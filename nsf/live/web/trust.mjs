@@ -113,9 +113,15 @@ export class Trust {
     return {
       signal: Math.sqrt(squares / (M - 1)),
       moved: Math.hypot(...mean.map((value, j) => value - start[j])),
-      left: Math.hypot(...beyond) / size > leeway,
+      left: Math.hypot(...beyond) / size > leeway || this._rare(mean),
       gravity: Math.max(0, ...steps.map((acting) => Math.hypot(...acting.map((value, i) => value - gravity[i])))),
     };
+  }
+
+  /** Whether few of the runs that taught come near to a state in metres. @param {number[]} state */
+  _rare(state) {
+    const { usual } = this.told.reach;
+    return Boolean(usual) && !usual.rows.some((/** @type {number[]} */ row) => Math.hypot(...row.map((value, j) => value - state[j])) <= usual.leeway);
   }
 
   /**

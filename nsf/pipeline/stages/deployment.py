@@ -56,7 +56,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
         trust.save(record.path / TRUST)
         record.output(TRUST)
         runs = len(trust.calibration.errors) if trust.calibration else 0
-        if runs and not trust.calibration.lost:
+        if runs and runs == len(pipeline.validating.held_out):  # else the worst of them do not count
             record.metrics["validation_error"] = float(trust.calibration.errors.mean())
         if 0 < runs < ENOUGH:
             pipeline.say(

@@ -116,8 +116,8 @@ def fallen(count, of=100):
 def test_a_run_is_usual_that_keeps_as_near_to_others_as_nineteen_of_twenty_do():
     usual, rare = Usual.of(fallen(1)), LATENTS + T[:, None] * [0.3, 0.7]
     assert 0.0 < usual.leeway < 0.1
-    assert not usual.left(LATENTS).any()
-    assert usual.left(rare).tolist() == [False] + [True] * 5
+    assert not usual.left(LATENTS, 1).any()
+    assert usual.left(rare, 1).tolist() == [False] + [True] * 5
     one = reach(states=Band.of_states(fallen(1).reshape(-1, 2), []), usual=usual)
     assert one.of_states(rare).any()
     assert not reach(states=one.states).of_states(rare).any()

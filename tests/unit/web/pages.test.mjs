@@ -246,6 +246,11 @@ test("the light is the bound's, and names its reason", () => {
   assert.equal(light(strided(0), [41]).text.split("; ")[1], "angle=41° is outside of 20 … 40");
   assert.match(light(strided(0, 0.5, [0, 1, -4])).text, /^red: .*gravity is 1 m\/s² from that which was taught, 0.5 m\/s² at most/);
   assert.match(light(strided(0, 2)).text, /^red: .*its shape left those of the training runs at t = 2 s/);
+  const rare = trust();
+  rare.told.reach.usual = { rows: [[0], [1]], leeway: 0.1, every: 1 };
+  assert.equal(light(strided(0), [30], rare).level, "green"); // it comes to 0, 1 and 1 m
+  rare.forget();
+  assert.match(light(strided(0, 0.7), [30], rare).text, /^red: .*its shape left those of the training runs at t = 2 s/);
   assert.equal(light({ ...strided(0), diverged: true }).level, "red");
   assert.equal(light(strided(0), [30], trust({ calibration: null })).text, "unknown: no validation run tells (set scene.design.validation)");
   assert.equal(new Trust({ header: { parameters: [] }, arrays: {} }).light(strided(0), [], 2, true).level, "unknown");
