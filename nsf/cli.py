@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nsf import paths, usage, words
 from nsf.errors import ConfigError, NSFError, first_line, out_of_memory
+from nsf.extras import COMMAND, STARTED
 from nsf.paths import reports_folder
 from nsf.terminal import guard, screen
 from nsf.usage import STAGES, TOOLS
@@ -15,7 +16,10 @@ from nsf.usage import STAGES, TOOLS
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `nsf`; exits with 0, 2 (a fault the user can mend), 130 (interrupted) or 1."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        COMMAND[:] = [STARTED]
+        arguments = sys.argv[1:]
+    arguments = list(arguments)
     guard()
     # Threads that spin for long while they wait made training ten times slower on cores that others
     # use too; those that spin for some microseconds lose next to nothing on free ones.

@@ -14,6 +14,8 @@ from nsf.errors import MissingExtraError
 
 #: When this process began to import nsf, by `time.monotonic` [s].
 STARTED = time.monotonic()
+#: Holds it where the process is a command of the command line, which has no idle time before its work.
+COMMAND: list[float] = []
 
 
 def on_first_use(package: str) -> Callable[[str], Any]:

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, T
 from rich.progress import Progress as RichProgress
 from rich.text import Text
 
-from nsf.extras import STARTED
+from nsf.extras import COMMAND
 from nsf.terminal import console
 
 #: Between two lines of a log [s].
@@ -82,14 +82,15 @@ class Progress:
 
 _SECONDS: dict[str, float] = {}  # of this process's stages
 START = "start"
-"""Stands for a stage in `timed`: imports, and all before the first stage."""
+"""Stands for a stage in `timed`: imports and, of a command, all before its first stage."""
 
 
 @contextlib.contextmanager
 def timed(stage: str) -> Iterator[None]:
     """Count the time of the block as that of a stage, and not as that of a block around it."""
     begun = time.monotonic()
-    _SECONDS.setdefault(START, begun - STARTED)
+    if COMMAND:
+        _SECONDS.setdefault(START, begun - COMMAND[0])
     before = sum(_SECONDS.values())
     try:
         yield

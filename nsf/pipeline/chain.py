@@ -325,8 +325,9 @@ class Pipeline(Configured):
                 from nsf.pipeline.stages.simulation import simulate_missing
 
             self.check()
-            with measured(self, "simulate"):
-                simulate_missing(self, missing, warned)
+            with measured(self, "simulate") as works:
+                if simulate_missing(self, missing, warned) < len(missing) or needless:
+                    works.clear()
         return runs
 
     def full_order(self, cases: Sequence[Case]) -> list[Run]:

@@ -100,13 +100,32 @@ class Interval:
 
 
 @contextmanager
-def measured(pipeline, stage: str) -> Iterator[None]:
-    """Add the time of the block, in which a pipeline does the work of a stage, to the times of its store."""
-    runs, started = due(pipeline, stage), time.monotonic()
-    yield
-    if runs:
-        seconds = time.monotonic() - started
-        _add(pipeline.training.root / FILE, work_of(pipeline, stage, runs.values()), seconds)
+def measured(pipeline, stage: str) -> Iterator[list[Work]]:
+    """Add the time of the block, in which a pipeline does the work of a stage, to the times of its store.
+
+    Yields:
+        The work, at most one, that is added after the block, which clears it where others did a part.
+    """
+    works, started = _expected(pipeline, stage), time.monotonic()
+    yield works
+    for work in works:
+        _add(pipeline.training.root / FILE, work, time.monotonic() - started)
+
+
+def _expected(pipeline, stage: str) -> list[Work]:
+    """The work of a stage; none where a part of it is done, or where a user's class allows no estimate."""
+    try:
+        runs = due(pipeline, stage)
+        if not runs or (stage in _SECONDS and any(map(_begun, runs))):
+            return []
+        return [work_of(pipeline, stage, runs.values())]
+    except Exception:  # what is wrong with a stage, the stage says
+        return []
+
+
+def _begun(run: Run) -> bool:
+    """Whether the folder of a run has files, beside its lock."""
+    return any(not path.name.startswith(".") for path in run.path.glob("*"))
 
 
 def due(pipeline, stage: str) -> dict[Run | Path, float]:
@@ -137,7 +156,9 @@ def work_of(pipeline, stage: str, seconds: Iterable[float]) -> Work:
 
 def crowding() -> float:
     """How many times as long work takes beside the other work of this machine's last minute."""
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    load = 0.0
+    with suppress(OSError, AttributeError):  # not every system tells
+        load = os.getloadavg()[0]
     return max(1.0, load / (os.cpu_count() or 1))
 
 

@@ -17,8 +17,8 @@ from nsf.scenes.checks import host_bytes
 from nsf.scenes.resolution import resolution_warnings
 
 
-def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str]) -> None:
-    """Make the trajectories of a pipeline that are not there.
+def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str]) -> int:
+    """Make the trajectories of a pipeline that are not there; gives how many were made here.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
@@ -36,6 +36,7 @@ def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str]
     made = make(pipeline, runs, warnings)
     elsewhere = f", {len(runs) - made} by another process" if made < len(runs) else ""
     pipeline.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
+    return made
 
 
 def make(
