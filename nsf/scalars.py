@@ -74,6 +74,8 @@ def one_of(key: str, value: Any, options: Iterable) -> Any:
     """
     options = list(options)
     if not any(value == option and type(value) is type(option) for option in options):
+        if not options:
+            raise ConfigError(f"{key}={shown(value)} is unknown, with nothing to choose; leave it out")
         *names, last = [str(o).lower() if isinstance(o, bool) else shown(o) for o in options]
         choices = f"{', '.join(names)} or {last}" if names else last
         raise ConfigError(f"{key}={shown(value)} is unknown; choose {choices}")

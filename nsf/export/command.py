@@ -33,6 +33,7 @@ examples:
 
 
 LIVE = "live"  # the format that holds the model in place of a run
+_MOST = 10**9 - 1  # points, or steps
 _OF_PLAYBACKS = ("parameter", "color", "every", "fps")
 
 
@@ -54,12 +55,12 @@ def _parser() -> argparse.ArgumentParser:
         ("parameter", text, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
         (
             "points",
-            whole(),
+            whole(most=_MOST),
             None,
             "how many; more than the particles are points in between (super-resolution)",
         ),
         ("color", text, None, "von_mises, the default, or displacement"),
-        ("every", whole(), None, "takes each EVERY-th step; all by default"),
+        ("every", whole(most=_MOST), None, "takes each EVERY-th step; all by default"),
         ("fps", positive, None, "frames shown a second (30)"),
         ("device", text, "auto", "where the fields are decoded: cpu, cuda, cuda:N or auto"),
         ("output", text, None, "folder; export/<scene>-<hash> in ./reports (NSF_REPORTS) by default"),

@@ -120,7 +120,7 @@ def best(words: Sequence[str], trials: Path) -> str:
     """
     ranges, fixed = _parted(words)
     table = parsed(trials, [r.key for r in ranges])
-    name = next(name for name in OBJECTIVES if name in table)
+    name = next(name for name in table if name in OBJECTIVES)
     row = table.loc[table[name].idxmin()]
     tried = [f"{r.key}={row[r.key]}" for r in ranges]
     words = [word for word in fixed if not word.startswith("search.")]
@@ -216,8 +216,9 @@ def _tried(overrides: list[str], objectives: Sequence[str], root: Path | None) -
     config = configuration.load([*overrides, "deploy.split=validation"])
     pipeline = Pipeline(config, lambda line: None, root)
     pipeline.split = replace(pipeline.split, test=())  # which a search never looks at
-    for stage in pipeline.stages[:-1]:
-        run = pipeline.run(stage)
+    with pipeline.tracked:
+        for stage in pipeline.stages[:-1]:
+            run = pipeline.run(stage)
     results = read(run.file("results.csv"))
     if set(results["split"]) != {"validation"}:
         raise ConfigError(f"{run.id} is not of the validation cases alone; leave deploy.split out")

@@ -96,7 +96,7 @@ class Reports:
         """With every report that `nsf report` wrote below the folder, each in the place of its older rows."""
         frame, records = self.frame, dict(self.records)
         for mark in sorted(self.folder.rglob(f"*/{MARK}")):
-            if "listed" in read(mark) or not not_ignored([mark.with_name("delta.png")]):
+            if not not_ignored([mark.with_name("delta.png")]) or "listed" in read(mark):
                 continue
             name = mark.parent.relative_to(self.folder).as_posix()
             rows = table.read(mark.with_name(TABLE)).assign(report=name)

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from nsf.results.overview.index import write_index
+from nsf.results.overview.index import thumbnail, write_index
 from nsf.runs import Run
 
 
@@ -28,6 +28,16 @@ def test_thumbnails_are_drawn_once(page_of, chain):
     assert [picture.stat().st_mtime_ns for picture in pictures] == before
     assert chain.pipeline.evaluation.hash in page_of.read_text()
     assert "&lt;lost&gt;" in page_of.read_text()
+
+
+def test_losses_of_earlier_versions_are_drawn(tmp_path):
+    run = Run.open("train", "sand", {"latent_dim": 4}, root=tmp_path)
+    with run.record() as record:
+        log = run.path / "stress" / "csv" / "0" / "metrics.csv"
+        log.parent.mkdir(parents=True)
+        log.write_text("step,loss\n0,1.0\n1,0.5\n")
+        record.output(log)
+    assert thumbnail(run, tmp_path / "drawn.png")
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from nsf.config import composing
 from nsf.config.resolvers import following, resolved
 from nsf.errors import ConfigError
 from nsf.paths import CONF, groups
+from nsf.scalars import one_of
 
 
 def test_defaults_compose():
@@ -268,3 +269,8 @@ def test_a_file_with_a_removed_key_is_refused(tmp_path):
     path.write_text(OmegaConf.to_yaml(whole))
     with pytest.raises(ConfigError, match=r"config\.yaml: trainer\.devices was removed"):
         config.read(path)
+
+
+def test_a_choice_of_nothing_is_refused():
+    with pytest.raises(ConfigError, match=r"field=basis .* nothing to choose"):
+        one_of("field", "basis", [])

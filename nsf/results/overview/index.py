@@ -113,7 +113,8 @@ def _trained(ax: Axes, run: Run) -> None:
         raise ValueError("no log")
     for color, (phase, logs) in zip(PALETTE, phases.items(), strict=False):
         loss = pd.concat(map(pd.read_csv, logs)).sort_values("step")
-        ax.semilogy(loss["step"], loss[f"{phase}/loss"], color=color, linewidth=1)
+        name = f"{phase}/loss" if f"{phase}/loss" in loss else "loss"  # of earlier versions
+        ax.semilogy(loss["step"], loss[name], color=color, linewidth=1)
 
 
 def _deployed(ax: Axes, run: Run) -> None:
