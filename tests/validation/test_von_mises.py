@@ -18,6 +18,7 @@ from nsf.mpm.materials import (
     deformation_path,
     drive,
 )
+from nsf.mpm.stressed import stressed
 
 E, NU, TAU_Y = 1e6, 0.3, 2e4
 ELASTIC = Hencky(E, NU)
@@ -293,14 +294,117 @@ def test_flow_stress_of_plastic_strain(precision, rtol):
 
 
 @dataclass(frozen=True)
+class Voce(IsotropicHardening):
+    yield_stress: float
+    saturation: float
+    rate: float = 20.0
+
+    def flow_stress(self, gamma):
+        return self.saturation + (self.yield_stress - self.saturation) * math.exp(-self.rate * gamma)
+
+
+def sheared(norms):
+    """[P, 3, 3] stresses of these ‖dev τ‖ under a pressure."""
+    tau = np.tile(-5e4 * np.eye(3), (len(norms), 1, 1))
+    tau[:, 0, 1] = tau[:, 1, 0] = np.array(norms) / math.sqrt(2.0)
+    return tau
+
+
+def test_history_from_the_stress_holds_it():
+    """The flow stress is ‖dev τ‖ where the law reaches it, else its largest: at rest where it softens."""
+    norms = TAU_Y * np.array([0.0, 0.5, 1.0 + 1e-6, 1.3, 1.99])
+    linear, reference = Linear(E, NU, TAU_Y, 1e5), VonMisesHardening(E, NU, TAU_Y, hardening=0.15)
+    stresses = [[linear.flow_stress(gamma)] for gamma in linear.history_of(sheared(norms))[:, 0]]
+    np.testing.assert_allclose(stresses, reference.history_of(sheared(norms)), rtol=1e-9)
+    voce = Voce(E, NU, TAU_Y, 2.0 * TAU_Y)
+    gammas = voce.history_of(sheared([*norms, 3.0 * TAU_Y]))[:, 0]
+    expected = [*np.maximum(norms, TAU_Y), 2.0 * TAU_Y]
+    np.testing.assert_allclose([voce.flow_stress(gamma) for gamma in gammas], expected, rtol=1e-9)
+    assert not gammas[:2].any()
+    assert not Voce(E, NU, TAU_Y, 0.5 * TAU_Y).history_of(sheared(norms)).any()
+
+
+def test_hardened_particle_keeps_its_stress_when_taken_up(material_points):
+    """A step at rest from a stress above the flow stress at rest leaves it."""
+    voce, tau = Voce(E, NU, TAU_Y, 2.0 * TAU_Y), sheared([1.5 * TAU_Y])
+    start, _ = stressed(voce, tau, np.array([MU]), np.array([LAM]))
+    points = material_points(voce, 1)
+    points.F_e, points.history = start["F_e"], start["history"]
+    np.testing.assert_allclose(points.step(np.eye(3)).tau, tau, rtol=0, atol=1e-9 * TAU_Y)
+
+
+RATIO = 2.0
+
+
+@dataclass(frozen=True)
 class Untyped(Linear):
     def flow_stress(self, gamma):
         return self.yield_stress * (1.0 + gamma)
 
 
+@dataclass(frozen=True)
+class ModuleConstant(Linear):
+    def flow_stress(self, gamma):
+        return self.yield_stress + self.slope * type(gamma)(RATIO) * gamma + RATIO
+
+
+@dataclass(frozen=True)
+class Pi(Linear):
+    def flow_stress(self, gamma):
+        return self.yield_stress + self.slope * math.pi * gamma
+
+
+@dataclass(frozen=True)
+class NotAField(Linear):
+    def flow_stress(self, gamma):
+        return self.yield_stress + self.mu * gamma
+
+
+@dataclass(frozen=True)
+class Super(Linear):
+    def flow_stress(self, gamma):
+        return super().flow_stress(gamma)
+
+
+@dataclass(frozen=True)
+class Unnamed(Linear):
+    def flow_stress(self, gamma):
+        return self.yield_stress + wrong(gamma)  # noqa: F821
+
+
+@dataclass(frozen=True)
+class Argument(Linear):
+    def flow_stress(gamma):
+        return gamma
+
+
+TYPED = """
+class Typed(Linear):
+    def flow_stress(self, gamma):
+        return self.yield_stress + self.slope * gamma
+"""
+
+
+def typed_in_an_interpreter(*values):
+    names = {"Linear": Linear, "__name__": __name__}
+    exec(compile(TYPED, "<stdin>", "exec"), names)
+    return names["Typed"](*values)
+
+
 @pytest.mark.parametrize(
     ("law", "slope", "named"),
-    [(Untyped, 0.0, r"number 1.0; write type\(gamma\)\(1.0\)"), (Linear, math.nan, "positive and finite")],
+    [
+        (Untyped, 0.0, r"number 1.0; write type\(gamma\)\(1.0\)"),
+        (ModuleConstant, 0.0, r"number RATIO; write type\(gamma\)\(RATIO\)"),
+        (Pi, 0.0, r"write type\(gamma\)\(math.pi\)"),
+        (NotAField, 0.0, "self.mu, which is no field"),
+        (Super, 0.0, "write the whole formula"),
+        (Argument, 0.0, r"def flow_stress\(self, gamma\)"),
+        (Unnamed, 0.0, "raises NameError: .*'wrong'"),
+        (Linear, "2e5", "raises TypeError"),
+        (typed_in_an_interpreter, 0.0, "write the class in a file"),
+        (Linear, math.nan, "positive and finite"),
+    ],
 )
 def test_flow_stress_that_no_run_can_have(law, slope, named):
     with pytest.raises(ConfigError, match=named):

@@ -11,14 +11,15 @@ from types import FunctionType
 
 import numpy as np
 
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, first_line
 from nsf.mpm.materials.base import LawFunctions, Material
 from nsf.mpm.materials.hencky import hencky_stretches, hencky_tau
-from nsf.mpm.materials.von_mises import von_mises_update
+from nsf.mpm.materials.von_mises import deviator_norm, von_mises_update
 from nsf.mpm.precision import Precision
 
 #: [-] plastic strains at which a flow stress is checked.
 _CHECKED = (0.0, *np.geomspace(1e-4, 10.0, 51).tolist())
+_HALVINGS = 30  # of the bracket between two of these, down to 3e-10 of the larger
 
 
 @cache
@@ -51,20 +52,68 @@ def _annotated(method, *types: type) -> FunctionType:
 
 
 @cache
-def _check_numbers(law: type) -> None:
-    """Refuse numbers in the text of a flow stress, which Warp would take for fp32 and int."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(law.flow_stress)))
+def _check_text(law: type) -> None:
+    """Refuse a flow stress that Python evaluates and Warp cannot compile in each precision."""
+    name = f"{law.__name__}.flow_stress"
+    method = law.flow_stress
+    if not inspect.isfunction(method) or method.__code__.co_argcount != 2 or method.__name__ == "<lambda>":
+        raise ConfigError(f"{name} must be a plain method; write def flow_stress(self, gamma)")
+    if method.__code__.co_freevars:
+        raise ConfigError(
+            f"{name} uses super(), a decorator or a name of an enclosing function, which no run can compile; "
+            "write the whole formula from the fields of the law"
+        )
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(method)))
+    except (OSError, SyntaxError) as error:
+        raise ConfigError(
+            f"{name} has no readable text ({first_line(error)}); write the class in a file and import it"
+        ) from error
+    _check_fields(law, tree)
+    _check_numbers(law, tree)
+
+
+def _check_fields(law: type, tree: ast.AST) -> None:
+    """Refuse attributes that the Warp struct of the law's constants lacks."""
+    self_name = law.flow_stress.__code__.co_varnames[0]
+    constants = {field.name for field in fields(law)}
+    for node in ast.walk(tree):
+        match node:
+            case ast.Attribute(value=ast.Name(id=owner), attr=name) if owner == self_name:
+                if name not in constants:
+                    raise ConfigError(
+                        f"{law.__name__}.flow_stress reads {owner}.{name}, which is no field; "
+                        f"declare a field of the law, or compute it from {', '.join(sorted(constants))}"
+                    )
+
+
+def _check_numbers(law: type, tree: ast.AST) -> None:
+    """Refuse numbers and constants of modules, which Warp would take for fp32 and int."""
     calls = [
         node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Call)
     ]
     typed = {part for call in calls for value in call.args for part in ast.walk(value)}
+    code = law.flow_stress.__code__
+    constants = {k: v for k, v in law.flow_stress.__globals__.items() if k not in code.co_varnames}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and node not in typed:
-            gamma = law.flow_stress.__code__.co_varnames[1]
+        if node not in typed and isinstance(_value(node, constants), int | float):
+            text, gamma = ast.unparse(node), code.co_varnames[1]
             raise ConfigError(
-                f"{law.__name__}.flow_stress has the number {node.value}; write type({gamma})({node.value}), "
+                f"{law.__name__}.flow_stress has the number {text}; write type({gamma})({text}), "
                 "which has the precision of a run"
             )
+
+
+def _value(node: ast.AST, constants: dict):
+    """The value of a literal, of a module's constant or of an attribute of a module; else None."""
+    match node:
+        case ast.Constant(value=value):
+            return value
+        case ast.Name(id=name):
+            return constants.get(name)
+        case ast.Attribute(value=ast.Name(id=module), attr=name):
+            return getattr(constants.get(module), name, None)
+    return None
 
 
 @dataclass(frozen=True)
@@ -79,21 +128,23 @@ class IsotropicHardening(Material):
     Each return goes to the flow stress before the step, so that ‖dev τ‖ lags by one step.
 
     Raises:
-        ConfigError: a flow stress is not positive and finite, or has bare numbers.
+        ConfigError: a flow stress fails, is not positive and finite, or cannot be compiled.
     """
 
     def __post_init__(self):
         super().__post_init__()
-        _check_numbers(type(self))
+        _check_text(type(self))
         for gamma in _CHECKED:
+            value = f"{type(self).__name__}.flow_stress({gamma:.3g})"
             try:
                 stress = float(self.flow_stress(gamma))
-            except (ArithmeticError, ValueError) as error:
-                stress = error
-            if not (isinstance(stress, float) and 0.0 < stress < math.inf):
+            except Exception as error:
                 raise ConfigError(
-                    f"{type(self).__name__}.flow_stress({gamma:.3g})={stress} Pa must be positive and finite"
-                )
+                    f"{value} raises {type(error).__name__}: {first_line(error)}; it must be a positive "
+                    "and finite number of Pa, from the fields of the law and functions of math"
+                ) from error
+            if not 0.0 < stress < math.inf:
+                raise ConfigError(f"{value}={stress} Pa must be positive and finite")
 
     @abstractmethod
     def flow_stress(self, gamma: float) -> float:
@@ -106,3 +157,30 @@ class IsotropicHardening(Material):
     def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
         """[P, 3] stretches of [P, 3] principal stresses, in closed form."""
         return hencky_stretches(principal, mu, lam)
+
+    def history_of(self, tau: np.ndarray) -> np.ndarray:
+        """[P, 1] lower bound of γ: the least whose flow stress holds ‖dev τ‖, zero up to that at rest.
+
+        By bisection between the checked strains. Where no flow stress holds ‖dev τ‖, because the law softens
+        or saturates below it, γ is that of the largest, and the next return goes to it. As in
+        `VonMisesHardening`, the bound misses the hardening of a particle that has unloaded since.
+
+        Args:
+            tau: [P, 3, 3] Kirchhoff stress [Pa].
+        """
+        carried, strains = deviator_norm(tau), np.array(_CHECKED)
+        stresses = self._flow_stresses(strains)
+        upper = np.searchsorted(np.maximum.accumulate(stresses), carried)
+        upper = np.minimum(upper, stresses.argmax())
+        gamma, hardened = strains[upper], upper > 0
+        low, high, carried = strains[upper[hardened] - 1], gamma[hardened], carried[hardened]
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            holds = self._flow_stresses(middle) >= carried
+            low, high = np.where(holds, low, middle), np.where(holds, middle, high)
+        gamma[hardened] = high
+        return gamma[:, None]
+
+    def _flow_stresses(self, gamma: np.ndarray) -> np.ndarray:
+        """[n] flow stresses [Pa] at plastic strains [n]; one by one, as `flow_stress` takes numbers."""
+        return np.array([self.flow_stress(value) for value in gamma.tolist()], float)

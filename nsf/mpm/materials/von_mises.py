@@ -12,6 +12,12 @@ from nsf.mpm.materials.hencky import hencky_stretches, hencky_tau, hencky_update
 from nsf.mpm.precision import Precision
 
 
+def deviator_norm(tau: np.ndarray) -> np.ndarray:
+    """[P] ‖dev τ‖ [Pa] of [P, 3, 3] Kirchhoff stresses [Pa]."""
+    mean = np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3.0
+    return np.linalg.norm(tau - mean * np.eye(3), axis=(1, 2))
+
+
 def von_mises_update(precision: Precision, bound, hardened, Params):
     """Warp function of the constitutive update of a von Mises law over Hencky elasticity.
 
@@ -149,9 +155,7 @@ class VonMisesHardening(VonMises):
 
         The bound misses the hardening of a particle that has unloaded since.
         """
-        mean = np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3.0
-        carried = np.linalg.norm(tau - mean * np.eye(3), axis=(1, 2))
-        return np.maximum(carried, self.yield_stress)[:, None]
+        return np.maximum(deviator_norm(tau), self.yield_stress)[:, None]
 
 
 @dataclass(frozen=True)
