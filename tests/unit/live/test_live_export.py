@@ -236,7 +236,7 @@ def test_a_slider_changes_the_run_and_the_light(opened, page, taught_model):
 
 @pytest.mark.slow
 def test_a_drag_tilts_gravity_and_the_body_follows(opened, tilting_page):
-    tab = opened(tilting_page)
+    tab = opened(tilting_page, 1000, 700)  # with the whole pad in sight
     paused(tab, 0)
     box = tab.locator("#pad").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
