@@ -14,13 +14,15 @@ from nsf.results.formats import Rows
 #: Metrics of an evaluate run that are shown: means over its cases.
 _ERRORS = ("displacement_error", "stress_error", "delta")
 _TIMES = ("step_ms_full", "step_ms")
+#: Keys that change what is validated.
+_OTHER_CASES = ("scene", "scale", "deploy")
 _VALIDATION = "validation_error"
 
 
 def outcome(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> tuple[Rows, str] | None:
     """A row a job, and which one is best, with its command; None where there is only one job.
 
-    Jobs of several scenes, or without validation values, have no best.
+    Jobs whose validation cases may differ, or that have none, have no best.
 
     Args:
         sweeps: overrides whose keys may have several values.
@@ -51,7 +53,7 @@ def outcome(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> tuple
     ]
     rows = Rows(headings, body, [False] * len(varied) + [True, False] + [True] * len(shown))
     validated = [at for at, result in enumerate(results) if _VALIDATION in result]
-    if "scene" in varied or not validated:
+    if any(key.split(".")[0] in _OTHER_CASES for key in varied) or not validated:
         return rows, ""
     best = min(validated, key=lambda at: results[at][_VALIDATION])
     score = f"displacement error {number(results[best][_VALIDATION], 100)} %"
