@@ -9,11 +9,13 @@ alone, in its folder.
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
+from nsf.errors import first_line
 from nsf.extras import optional
 from nsf.runs import Run
 from nsf.storage import locked
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 #: Tools that track a chain, each with the extra that brings it.
 EXTRAS = {"tensorboard": "track", "mlflow": "mlflow", "wandb": "wandb"}
 TRACKING = ("none", "csv", *EXTRAS)
+#: Methods of a logger that Lightning calls.
+_LOGGED = ("log_hyperparams", "log_graph", "log_metrics", "save", "finalize", "after_save_checkpoint")
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,8 @@ def check_tracking(tracking: str | None) -> None:
 class Tracked:
     """The tracked run of a pipeline, which begins with its first use.
 
+    An error of the tool is one line of warning: it then gets the end of the run alone, and the chain goes on.
+
     Args:
         pipeline: a `nsf.pipeline.Pipeline`; its `group` is a parent.
     """
@@ -64,6 +70,7 @@ class Tracked:
     def __init__(self, pipeline):
         self._pipeline = pipeline
         self._tool: Tool | None = None
+        self._failed = False
 
     def loggers(self, folder: Path) -> "list[Logger]":
         """Loggers of Lightning for a phase of the training: the csv file in its folder, and the tool's."""
@@ -75,7 +82,8 @@ class Tracked:
         # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
         version = str(len(list((folder / "csv").glob("*"))))
         losses = CSVLogger(folder, name="csv", version=version, flush_logs_every_n_steps=1)
-        return [losses, self._begun().logger] if kind in EXTRAS else [losses]
+        tool = self._begun() if kind in EXTRAS else None
+        return [losses, tool.logger] if tool else [losses]
 
     def __enter__(self) -> "Tracked":
         return self
@@ -84,24 +92,60 @@ class Tracked:
         """Add figures and files of what is there, and close the run."""
         if self._pipeline.config.tracking not in EXTRAS or (kind and not self._tool):
             return
-        tool = self._begun()
-        if kind is None:
-            tool.conclude(self._keys(), figures(self._pipeline))
-            for path in files(self._pipeline):
-                tool.put(path)
-        tool.end("failed" if kind else "success")
-        self._tool = None
+        try:
+            if kind is None and (tool := self._begun()):
+                self._call(tool.conclude, self._keys(), figures(self._pipeline))
+                for path in files(self._pipeline):
+                    self._call(tool.put, path)
+        finally:
+            if self._tool:
+                self._end(self._tool, "failed" if kind else "success")
+            self._tool, self._failed = None, False
 
-    def _begun(self) -> Tool:
+    def _begun(self) -> Tool | None:
+        """The tool's run; None where it could not begin."""
         if self._tool is None:
             pipeline = self._pipeline
             run = pipeline.evaluation
-            start = {"tensorboard": _tensorboard, "mlflow": _mlflow, "wandb": _wandb}
+            start = {"tensorboard": _tensorboard, "mlflow": _mlflow, "wandb": _wandb}[
+                pipeline.config.tracking
+            ]
             run.root.mkdir(parents=True, exist_ok=True)
-            self._tool = start[pipeline.config.tracking](run, run.root.resolve(), pipeline.group)
-            if self._tool.new:
-                self._tool.logger.log_hyperparams(self._keys())
+            self._tool = self._call(start, run, run.root.resolve(), pipeline.group)
+            if self._tool:
+                self._open(self._tool)
         return self._tool
+
+    def _open(self, tool: Tool) -> None:
+        """Log the keys of a new run; Lightning gets none of the errors of its logger."""
+        for name in _LOGGED:
+            if method := getattr(tool.logger, name, None):
+                setattr(tool.logger, name, partial(self._call, method))
+        self._call(getattr, tool.logger, "experiment", None)  # here, for Lightning would raise its errors
+        if tool.new:
+            tool.logger.log_hyperparams(self._keys())
+
+    def _call(self, function: Callable, *values: Any, **named: Any) -> Any:
+        """What a function of the tool gives; None from its first error on."""
+        if self._failed:
+            return None
+        try:
+            return function(*values, **named)
+        except Exception as error:
+            self._warn(error)
+            return None
+
+    def _end(self, tool: Tool, status: str) -> None:
+        try:
+            tool.end(status)
+        except Exception as error:
+            self._warn(error)
+
+    def _warn(self, error: Exception) -> None:
+        if not self._failed:
+            kind = self._pipeline.config.tracking
+            self._pipeline.say(f"tracking: warning: {kind} failed and gets no more ({first_line(error)})")
+        self._failed = True
 
     def _keys(self) -> dict[str, Any]:
         return flat(OmegaConf.to_container(self._pipeline.config, resolve=True))

@@ -38,6 +38,9 @@ class Fake:
     def log_hyperparams(self, keys):
         self.calls.append(("keys", keys))
 
+    def log_metrics(self, metrics, step):
+        self.calls.append(("metrics", step))
+
     def conclude(self, keys, values):
         self.calls.append(("figures", values))
 
@@ -71,6 +74,23 @@ def test_a_failed_chain_ends_as_failed(pipeline_at, tmp_path, monkeypatch):
     with pytest.raises(NSFError), pipeline.tracked:
         pipeline.evaluate()
     assert fake.calls[-1] == ("end", "failed")
+
+
+@pytest.mark.parametrize("method", ["__call__", "log_hyperparams", "log_metrics", "conclude", "put", "end"])
+def test_an_error_of_a_tool_is_one_warning(pipeline_at, copied, tmp_path, monkeypatch, method):
+    def unreachable(*_, **__):
+        raise ConnectionError("no server")
+
+    fake, said = Fake(), []
+    monkeypatch.setattr(tracking, "_tensorboard", unreachable if method == "__call__" else fake)
+    setattr(fake, method, unreachable)
+    pipeline = pipeline_at(copied("simulate", "train", "deploy", "evaluate"), "tracking=tensorboard")
+    monkeypatch.setattr(pipeline, "say", said.append)
+    with pipeline.tracked:
+        for logger in pipeline.tracked.loggers(tmp_path)[1:]:
+            logger.log_metrics({"loss": 1.0}, step=1)
+    assert said == ["tracking: warning: tensorboard failed and gets no more (no server)"]
+    assert method in ("__call__", "end") or fake.calls[-1] == ("end", "success")
 
 
 def test_jobs_of_a_sweep_have_a_parent(chain, tiny, monkeypatch):
