@@ -86,10 +86,15 @@ export class Page {
   paint(color) {
     const { told } = this.player, quantity = told.quantities[color];
     this.state.color = find("color").value = color;
-    this.player.paint?.(color);
     this.drawing.paint(quantity.colors ?? told.colors);
     legend(quantity, quantity.colors ?? told.colors);
     this.change();
+  }
+
+  /** Colour by a quantity that a user chooses, on a server for all who look. @param {string} color */
+  choose(color) {
+    this.paint(color);
+    this.player.paint?.(color);
   }
 
   /** Go back to t = 0, without a hand. */
@@ -175,7 +180,7 @@ export class Page {
         ...(player.speeds.length ? [choice("speed", "speed", player.speeds, player.speed, () => {})] : [])),
       element("div", { id: "light", role: "status" }),
       ...(player.controls?.(this) ?? []),
-      choice("color", "colour", colors, player.color, (color) => this.paint(color)),
+      choice("color", "colour", colors, player.color, (color) => this.choose(color)),
       cut,
       element("small", { id: "note" }),
     );
@@ -193,7 +198,8 @@ async function show() {
   const player = !packed ? await StreamPlayer.joined() : packed.header.recurrence ? new LivePlayer(packed) : new RecordedPlayer(packed);
   const page = new Page(player), asked = new URLSearchParams(location.hash.slice(1)), color = asked.get("color") ?? "";
   page.camera.follow(find("canvas"), (dx, dy) => player.drag?.(dx, dy) ?? false);
-  page.paint(color in player.told.quantities ? color : player.color);
+  page.paint(player.color);
+  if (color in player.told.quantities) page.choose(color);
   if (asked.has("frame")) page.seek(Number(asked.get("frame")) || 0);
   requestAnimationFrame((now) => page.next(now));
   Object.assign(window, { nsf: { page, player, state: page.state, camera: page.camera, drawing: page.drawing } });

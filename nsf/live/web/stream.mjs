@@ -62,7 +62,7 @@ export class StreamPlayer {
 
   /** @param {string} color */
   paint(color) {
-    if (!this.field && color !== this.state.color) this.send({ color });
+    if (!this.field) this.send({ color }); // always: what the server last told may be older than the last wish
   }
 
   /** @param {import("./page.mjs").Page} page */
