@@ -11,7 +11,7 @@ from nsf.scalars import number
 
 #: Coordinates of stress where programs force a scene, or do not.
 STRESS = {True: 32, False: 0}
-#: Windows in a step of the descent, likewise; 32 are as near as 128 on sand, bread and cake.
+#: Windows in a step of the descent, likewise.
 BATCH = {True: 128, False: 32}
 
 

@@ -256,7 +256,7 @@ class Pipeline(Configured):
                 return False
         if not all(run.complete for stage in later if stage != "report" for run in self.runs_of(stage)):
             return False
-        return "report" not in stages or self._kept_report() is not None
+        return "report" not in stages or self.kept_report() is not None
 
     def spare(self, later: Sequence[str]) -> set[str]:
         """Trajectories, by id, that later stages need not read, as their results are there."""
@@ -383,7 +383,7 @@ class Pipeline(Configured):
                 "no evaluate run of these held-out cases is there; run `nsf run` with the same keys"
             )
         said = f"report: evaluated runs: {len(runs)}"
-        if page := self._kept_report():
+        if page := self.kept_report():
             self.say(f"{said}, unchanged, reused → {page}")
             return page
         from nsf.results.report import build_report
@@ -393,7 +393,7 @@ class Pipeline(Configured):
         self.say(f"{said} → {page}")
         return page
 
-    def _kept_report(self) -> Path | None:
+    def kept_report(self) -> Path | None:
         """The page of the report, if nothing that it shows has changed since it was written."""
         runs = self.reported()
         return unchanged(self.report_folder, runs, self._question, self.evaluation) if runs else None

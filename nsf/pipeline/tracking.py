@@ -126,7 +126,7 @@ class Tracked:
             tool.logger.log_hyperparams(self._keys())
 
     def _call(self, function: Callable, *values: Any, **named: Any) -> Any:
-        """What a function of the tool gives; None from its first error on."""
+        """The result of a function of the tool; None from its first error on."""
         if self._failed:
             return None
         try:
@@ -178,7 +178,7 @@ def files(pipeline) -> list[Path]:
     """The table, the checkpoint, and the pictures of the report, as far as they are there."""
     table = [pipeline.evaluation.file("results.csv")] if pipeline.evaluation.complete else []
     checkpoint = [pipeline.training.file("manifold.pt")] if pipeline.training.complete else []
-    page = pipeline._kept_report()
+    page = pipeline.kept_report()
     return [*table, *checkpoint, *(sorted(page.parent.glob("*.png")) if page else [])]
 
 
