@@ -1,6 +1,7 @@
 """Whether to believe a run: what it left that was taught, and what it says of its error."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from nsf.deployment import Band, Calibration, Reach, Trust, Usual
 from nsf.errors import SchemaError
 from nsf.mpm import Cuboid, Motion
+from nsf.pipeline.stages.calibration import _tells
 from nsf.recurrence import collider_states
 
 T = np.linspace(0.0, 1.0, 6)
@@ -218,3 +220,14 @@ def test_a_lost_validation_run_widens_no_range():
     lost = LATENTS.copy()
     lost[-1] = np.nan
     assert Band.of_states(LATENTS, [lost]).leeway == Band.of_states(LATENTS, []).leeway
+
+
+def test_a_validation_run_that_left_what_was_taught_calibrates_nothing():
+    usual = Usual.of(fallen(1))
+    one = reach(states=Band.of_states(fallen(1).reshape(-1, 2), []), usual=usual)
+    rare = LATENTS + T[:, None] * [0.3, 0.7]
+    counts = [
+        _tells(SimpleNamespace(xhat=xhat, diverged=diverged), one, trust())
+        for xhat, diverged in ((LATENTS, -1), (rare, -1), (rare, 3))
+    ]
+    assert counts == [True, False, True]  # one that diverged counts, as lost
