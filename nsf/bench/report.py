@@ -14,7 +14,18 @@ from nsf.bench.rows import FILE, WIDE, read, size_name
 from nsf.results.charts.costs import bars
 from nsf.results.columns import axis, number
 from nsf.results.formats import Rows, TerminalTable, markdown_document
-from nsf.results.style import INK, PALETTE, band, figure, legend, line_style, plain_ticks, save, styled
+from nsf.results.style import (
+    FULL,
+    INK,
+    band,
+    figure,
+    legend,
+    line_style,
+    model_color,
+    plain_ticks,
+    save,
+    styled,
+)
 from nsf.storage import write_text
 
 _LEAD = (
@@ -271,7 +282,7 @@ def steps_by_scene(rows: pd.DataFrame) -> Figure:
         ):
             at, median = np.arange(len(part)), part["median"].to_numpy()
             full = part["case"].str.startswith("full_order")
-            panel.scatter(median, at, s=42, color=[PALETTE[0] if whole else PALETTE[1] for whole in full])
+            panel.scatter(median, at, s=42, color=np.where(full, FULL, model_color("projected")))
             for y, (case, precision, ms) in enumerate(part[["case", "precision", "median"]].to_numpy()):
                 delta = deltas.get((case, precision))
                 text = number(ms) if delta is None else f"{number(ms)}, δ {number(100 * delta)} %"

@@ -135,14 +135,17 @@ def brief(text: str) -> str:
 
 
 def model_name(row: Mapping) -> str:
-    """A model in words: `projected`, the baseline under its own name."""
-    stress, affine = row.get("stress") or "field", row.get("affine") or "field"
-    name = str(row["model"])
-    if name == "projected" and (stress, affine) == ("deformation", "none"):
+    """A model in words: `projected`, with what is not the paper's; the baseline under a name of its own."""
+    name, stress, affine = str(row["model"]), row.get("stress") or "field", row.get("affine") or "field"
+    if name != "projected":
+        return name
+    if (stress, affine) == ("deformation", "none"):
         return BASELINE
-    if name == "projected" and (stress, affine) != ("field", "field"):
-        return f"projected, stress={stress}, affine={affine}"
-    return name
+    changed = [f"stress={stress}"] if stress != "field" else []
+    # Particles that carry their stress carry their affine velocity as well.
+    if affine != ("particles" if stress == "particles" else "field"):
+        changed.append(f"affine={affine}")
+    return ", ".join([name, *changed])
 
 
 def is_empty(value) -> bool:

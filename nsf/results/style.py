@@ -15,10 +15,12 @@ import matplotlib
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
 
+from nsf.results.columns import BASELINE
 from nsf.results.formats import plain
 
 INK, MUTED, GRID, WARNING = "#222222", "#666666", "#dddddd", "#B04A00"
@@ -27,7 +29,30 @@ INK, MUTED, GRID, WARNING = "#222222", "#666666", "#dddddd", "#B04A00"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 2, 1.5, 2)))
 
-FULL, REDUCED, PAPER = "#7f7f7f", "#0072B2", "#000000"
+FULL, PAPER = "#7f7f7f", "#000000"
+
+#: Colour of a model in every chart, by its name in tables (`nsf.results.columns.model_name`); Okabe and Ito
+#: 2008, and Tol 2021 for models that lack one field.
+MODEL_COLORS = {
+    "full": FULL,
+    "projected": "#0072B2",
+    "projected, stress=particles": "#56B4E9",
+    "projected, stress=deformation": "#882255",
+    "projected, affine=none": "#332288",
+    BASELINE: "#CC79A7",
+    "recurrence": "#D55E00",
+    "interpolate": "#009E73",
+    "gru": "#E69F00",
+    "dmdc": "#8A7000",
+}
+#: Likewise of the rivals that tables hold models to.
+RIVAL_COLORS = {
+    "displacement_static": "#999999",
+    "displacement_nearest": "#666666",
+    "displacement_interpolated": MODEL_COLORS["interpolate"],
+    "displacement_coarse": FULL,
+}
+_OTHERS = ("#000000", "#AA4499", "#117733", "#999933", "#661100")  # models that the table lacks, in turn
 
 STAGE_COLORS = {
     "inference": "#0072B2",
@@ -78,6 +103,7 @@ _RC = {
 WIDTH = 9.6  # [inch] 960 px at 100 dpi: the width of a report's column
 PIXELS = 120  # an inch of a png: sharp at that width, and a report of many pictures stays small
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
+LOST_MARK = {"ls": "", "marker": "X", "ms": 8, "mec": "white", "mew": 0.8}
 _DOTS = 200  # values of which each is in sight; of more, as of many frames, an axis leaves the smallest out
 _COLORS = 256
 _RAMP = 64  # colours kept of each colour scale: its bar shows no steps
@@ -107,16 +133,33 @@ def figure(height: float, width: float = WIDTH) -> Figure:
     return Figure(figsize=(width, height), dpi=100)
 
 
+def model_color(name: str, k: int = 0, count: int = 1) -> str:
+    """Colour of a model, or the k-th of so many shades of it, from dark to light."""
+    others = int(hashlib.sha256(name.encode()).hexdigest(), 16) % len(_OTHERS)
+    color = np.array(to_rgb(MODEL_COLORS.get(name, _OTHERS[others])))
+    share = np.interp(k, [0, max(1, count - 1)], [-0.45, 0.45]) if count > 1 else 0.0
+    return to_hex(color + share * (1.0 - color) if share > 0 else color * (1.0 + share))
+
+
 def line_style(i: int) -> dict:
     """Colour and dash of the i-th line; dashes change once the colours are used up."""
     return {"color": PALETTE[i % len(PALETTE)], "linestyle": DASHES[i // len(PALETTE) % len(DASHES)]}
 
 
-def panels(count: int, height: float, across: int = 4, **shared) -> tuple[Figure, list[Axes]]:
-    """A figure with `count` panels of a height [inch], `across` in a row; options as of `subplots`."""
+def panels(
+    count: int, height: float | Sequence[float], across: int = 4, **shared
+) -> tuple[Figure, list[Axes]]:
+    """A figure with `count` panels, `across` in a row.
+
+    Args:
+        count, across: of panels.
+        height: of a row [inch], or of each panel, of which a row takes the first.
+        shared: options as of `subplots`.
+    """
     rows = math.ceil(count / across)
-    fig = figure(0.9 + height * rows)
-    grid = fig.subplots(rows, min(across, count), squeeze=False, **shared).ravel()
+    heights = [height] * rows if isinstance(height, float) else list(height)[::across]
+    fig = figure(0.9 + sum(heights))
+    grid = fig.subplots(rows, min(across, count), squeeze=False, height_ratios=heights, **shared).ravel()
     for panel in grid[count:]:
         panel.axis("off")
     return fig, list(grid[:count])

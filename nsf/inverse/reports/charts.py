@@ -7,12 +7,24 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.results.columns import axis
-from nsf.results.style import FULL, GRID, INK, MUTED, PALETTE, figure, legend, line_style, panels, styled
+from nsf.results.style import (
+    FULL,
+    GRID,
+    INK,
+    MUTED,
+    PALETTE,
+    figure,
+    legend,
+    line_style,
+    model_color,
+    panels,
+    styled,
+)
 from nsf.vectors import drawn
 
 _BODY = 1500  # particles that show a body
-_RUNS = {"fitted": "run by recurrence", "full_order": "full-order run"}
-"""Columns of residuals and targets, and the runs that they are of."""
+_RUNS = {"fitted": ("run by recurrence", model_color("recurrence")), "full_order": ("full-order run", FULL)}
+"""Columns of residuals and targets, and the runs that they are of with their colours."""
 
 
 def trials_chart(table: pd.DataFrame, units: Mapping[tuple[str, str], str]) -> Figure:
@@ -56,8 +68,8 @@ def points_chart(body: np.ndarray, observed: np.ndarray, fitted: np.ndarray, t: 
         fig = figure(4.4)
         for panel, (i, j) in zip(fig.subplots(1, 2), ((0, 2), (0, 1)), strict=True):
             panel.plot(*shown[:, [i, j]].T, ".", ms=3, color=FULL, alpha=0.35, mew=0, label="fitted run")
-            panel.plot(*fitted[:, [i, j]].T, "o", mfc="none", color=PALETTE[0], label="fitted")
-            panel.plot(*observed[:, [i, j]].T, "x", ms=4, color=PALETTE[1], label="observed")
+            panel.plot(*fitted[:, [i, j]].T, "o", mfc="none", color=model_color("recurrence"), label="fitted")
+            panel.plot(*observed[:, [i, j]].T, "x", ms=4, color=INK, label="observed")
             panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", title=f"t = {t:.4g} s")
             panel.set_aspect("equal", adjustable="datalim")
             panel.grid()
@@ -75,10 +87,10 @@ def residuals_chart(rows: pd.DataFrame) -> Figure:
     with styled():
         fig = figure(3.4)
         panel = fig.subplots()
-        for k, (column, name) in enumerate(_RUNS.items()):
+        for k, (column, (name, color)) in enumerate(_RUNS.items()):
             if column in rows:
                 t, off = rows["t"] + (k - 0.5) * 0.006 * end, 1e3 * (rows["value"] - rows[column])
-                panel.plot(t, off, "o", ms=3, alpha=0.5, label=name, color=PALETTE[k])
+                panel.plot(t, off, "o", ms=3, alpha=0.5, label=name, color=color)
         panel.axhline(0.0, color=MUTED, lw=0.8)
         panel.set(xlabel="time t [s]", ylabel="observed − run [mm]")
         panel.set_xlim(0.0, 1.05 * end or None)
@@ -100,10 +112,10 @@ def targets_chart(rows: pd.DataFrame) -> Figure:
         width = 1e3 * rows["tolerance"]
         reach = width.max()
         panel.barh(at, 2 * width, left=-width, height=0.6, color=GRID, label="tolerance")
-        for k, (column, name) in enumerate(_RUNS.items()):
+        for k, (column, (name, color)) in enumerate(_RUNS.items()):
             if column in rows:
                 off = 1e3 * (rows["value"] - rows[column])
-                panel.plot(off, at + 0.24 * (k - 0.5), "o", ms=6, label=name, color=PALETTE[k])
+                panel.plot(off, at + 0.24 * (k - 0.5), "o", ms=6, label=name, color=color)
                 reach = max(reach, off.abs().max())
         panel.axvline(0.0, color=MUTED, lw=0.8)
         panel.set(xlabel="target − run [mm]", xlim=(-1.1 * reach, 1.1 * reach))

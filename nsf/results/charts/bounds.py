@@ -6,7 +6,7 @@ import pandas as pd
 from nsf.results.charts.drawing import ERROR
 from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import COLUMNS
-from nsf.results.style import INK, LOST, MUTED, PALETTE, legend, panels, plain_ticks
+from nsf.results.style import INK, LOST, MUTED, legend, model_color, panels, plain_ticks
 
 #: Displacement errors above which a run ought not to be green, and below which it ought not to be red.
 BAD, GOOD = 0.2, 0.05
@@ -71,22 +71,25 @@ def error_bounds(view: View) -> Figures:
     rows = rows[np.isfinite(rows["error_bound"]) & (rows["error_bound"] > 0)]
     if rows["error_bound"].nunique() < 2:
         return {}
-    fig, (beside, holds) = panels(2, 3.4, 2)
+    groups = list(rows.groupby("body", sort=False))
+    across = 2 if len(groups) == 1 else 4
+    fig, (*each, holds) = panels(len(groups) + 1, 7.6 / across, across)
     ends = [100 * rows["error_bound"].min() / 2, min(200 * rows["error_bound"].max(), LOST)]
-    for i, (body, part) in enumerate(rows.groupby("body", sort=False)):
-        errors = np.clip(100 * part["displacement_error"], ends[0], ends[1])
-        style = {"color": PALETTE[i % len(PALETTE)], "label": body, "alpha": 0.7}
-        marker = "o^sD"[i // len(PALETTE) % 4]  # a colour comes again where there are many bodies
-        beside.plot(np.minimum(100 * part["error_bound"], ends[1]), errors, marker, ms=3.5, mew=0, **style)
-    beside.plot(ends, ends, color=INK, lw=1.0)
-    beside.set(xscale="log", yscale="log", xlabel=COLUMNS["error_bound"].heading, ylabel=ERROR)
-    beside.set(xlim=ends, ylim=ends)
-    plain_ticks(beside.xaxis), plain_ticks(beside.yaxis)
+    for i, (panel, (body, part)) in enumerate(zip(each, groups, strict=True)):
+        for name, of in part.groupby("model_name", sort=False):
+            errors = np.clip(100 * of["displacement_error"], ends[0], ends[1])
+            dots = {"ls": "", "marker": "o", "ms": 4, "mew": 0, "alpha": 0.7, "color": model_color(name)}
+            panel.plot(np.minimum(100 * of["error_bound"], ends[1]), errors, label=name, **dots)
+        panel.plot(ends, ends, color=INK, lw=1.0)
+        panel.set(xscale="log", yscale="log", xlim=ends, ylim=ends, title=body)
+        panel.set(xlabel=COLUMNS["error_bound"].heading, ylabel="" if i % across else ERROR)
+        plain_ticks(panel.xaxis), plain_ticks(panel.yaxis)
     within = rows[_within(rows)]
     ratios = (within["displacement_error"] / within["error_bound"]).to_numpy()
     holds.plot(_MULTIPLES, [100 * np.mean(ratios <= multiple) for multiple in _MULTIPLES], color=INK)
     holds.axvline(1.0, color=MUTED, lw=0.8), holds.axhline(90.0, color=MUTED, lw=0.8)
     holds.set(xscale="log", xlabel="multiple of the bound [–]", ylabel="runs below it [%]", ylim=(0, 102))
+    holds.set(title="all" if len(groups) > 1 else "")
     plain_ticks(holds.xaxis)
     legend(fig)
     return {"error-bounds": fig}

@@ -14,12 +14,14 @@ from matplotlib.lines import Line2D
 
 from nsf.data.case import PROGRAM, Case
 from nsf.errors import ConfigError
-from nsf.results.charts.drawing import ERROR, lines, whole_mean
+from nsf.results.charts.drawing import ERROR, line, styles, whole_mean
 from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import axis, number
 from nsf.results.style import (
     INK,
     LOST,
+    LOST_MARK,
+    MUTED,
     WARNING,
     WIDTH,
     band,
@@ -29,12 +31,12 @@ from nsf.results.style import (
     panels,
     plain_ticks,
 )
+from nsf.results.table import BEYOND
 
 COLORS = "viridis"
 """Colour scale of the maps of errors."""
 _FEWEST = 12  # cases of which means of neighbours say anything
 _CROSS = {"ls": "", "marker": "x", "ms": 4, "mew": 0.9, "color": "#aaaaaa"}
-_LOST = {"ls": "", "marker": "X", "ms": 8, "mec": "white", "mew": 0.8}
 _MAPS = 4  # in a row
 _WIDEST = 28  # letters of a line above a map
 
@@ -49,16 +51,19 @@ def error_over_parameters(view: View) -> Figures:
     planes = [(body, part, name) for body, part, names in _several(view) for name in names]
     if not planes:
         return {}
-    styles = lines(view.frame["variant"])
-    fig, drawn = panels(len(planes), 3.0, 3)
-    for panel, (body, part, name) in zip(drawn, planes, strict=True):
+    drawn = styles(view.frame.assign(variant=_base(view.frame)), "variant")
+    fig, each = panels(len(planes), 3.0, 3)
+    for panel, (body, part, name) in zip(each, planes, strict=True):
+        lost = 0  # rows of crosses
         for variant, rows in part.groupby("variant", sort=False):
-            errors = rows.groupby(name)["error"].mean()
-            _neighbours(panel, errors, styles[variant], name in view.logarithmic)
-        panel.set_title(body, pad=14)
+            lost += _crosses(panel, rows[name][rows["lost"]], drawn[variant]["color"], lost)
+            _neighbours(panel, rows, name, drawn[variant], name in view.logarithmic)
+        panel.set_title(body, pad=14 + 9 * max(0, lost - 1))
         panel.set(ylabel=ERROR)
         _scaled(panel, "x", part, name, name in view.logarithmic)
-        error_scale(panel, 100 * part["error"][part["error"] <= LOST / 100])
+        error_scale(panel, 100 * part["error"][~part["lost"]])
+    if any(part["beyond"].any() for _, part, _ in planes):
+        each[-1].plot([], [], "o", ms=4.5, color=MUTED, label="filled: beyond what was taught")
     legend(fig)
     return {"error-over-parameters": fig}
 
@@ -76,7 +81,9 @@ def error_map(view: View) -> Figures:
 def _maps(view: View, planes: list) -> Figure:
     rows = []
     for body, part, names in planes:
-        ranked = sorted(part.groupby("variant", sort=False), key=lambda one: _rank(one[1]["error"]))
+        ranked = sorted(
+            part.groupby("variant", sort=False), key=lambda one: _rank(one[1]["error"][~one[1]["beyond"]])
+        )
         rows += [(body, names, ranked[i : i + _MAPS]) for i in range(0, len(ranked), _MAPS)]
     columns = max(len(ranked) for *_, ranked in rows)
     scale = _colors(100 * pd.concat([part["error"] for _, part, _ in planes]))
@@ -85,7 +92,7 @@ def _maps(view: View, planes: list) -> Figure:
     for across, (body, names, ranked) in zip(grid, rows, strict=True):
         for panel, (variant, cases) in zip(across, ranked, strict=False):
             _map(panel, view, cases, names, scale)
-            title = [body, *textwrap.wrap(variant, _WIDEST), _summary(cases["error"])]
+            title = [body, *textwrap.wrap(variant, _WIDEST), _summary(_within(cases))]
             panel.set_title("\n".join(title), fontsize=9, fontweight="normal")
         for panel in across[len(ranked) :]:
             panel.axis("off")
@@ -93,18 +100,23 @@ def _maps(view: View, planes: list) -> Figure:
     plain_ticks(bar.ax.yaxis)
     bar.outline.set_visible(False)
     marks = [Line2D([], [], ls="", marker="o", ms=7, mfc="white", mec=INK, label="held-out case")]
-    marks += [Line2D([], [], **_LOST, color=WARNING, label="lost")]
+    if any(part["beyond"].any() for _, part, _ in planes):
+        beyond = {"marker": "s", "ms": 7, "mfc": "white", "mec": INK, "label": "beyond what was taught"}
+        marks.append(Line2D([], [], ls="", **beyond))
+    marks += [Line2D([], [], **LOST_MARK, color=WARNING, label="lost")]
     marks += [Line2D([], [], **_CROSS, label="training case")] if view.trained else []
-    fig.legend(handles=marks, loc="outside upper left", ncols=3)
+    fig.legend(handles=marks, loc="outside upper left", ncols=4)
     return fig
 
 
 def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
     """Bodies whose cases have several values: their rows with a column a parameter, and these names.
 
-    Errors are means over seeds, a row a case and variant, but for runs that the fallback took.
+    Errors are means over seeds, a row a case and variant, but for runs that the fallback took. `lost` says
+    whether a run diverged or is off by more than `LOST`, `beyond` whether it led beyond what was taught.
     """
     shown = view.frame[view.frame["fallback_share"].fillna(0) == 0]
+    shown = shown.assign(beyond=shown["variant"].str.endswith(BEYOND), variant=_base(shown))
     for body, part in shown.groupby("body", sort=False):
         try:
             cases = {text: Case.read(text) for text in part["case"].unique()}
@@ -113,39 +125,57 @@ def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
         names = [name for name in next(iter(cases.values())) if name != PROGRAM]
         if all(len(case) < 2 for case in cases.values()) or not names:
             continue
-        errors = part.groupby(["scene", "variant", "case"], sort=False)["displacement_error"]
+        errors = part.groupby(["scene", "variant", "case", "beyond"], sort=False)["displacement_error"]
         rows = errors.agg(whole_mean).rename("error").reset_index().dropna(subset="error")
+        rows["lost"] = ~(100 * rows["error"] <= LOST)
         yield body, rows.assign(**{n: [cases[text][n] for text in rows["case"]] for n in names}), names
 
 
-def _neighbours(panel, errors: pd.Series, style: dict, log: bool) -> None:
+def _base(frame: pd.DataFrame) -> pd.Series:
+    """Variants without the note on what led beyond what was taught."""
+    return frame["variant"].str.removesuffix(BEYOND)
+
+
+def _crosses(panel, at: pd.Series, color: str, row: int) -> bool:
+    """Crosses above the panel for cases of one variant that are lost, in a row apart; whether any is."""
+    if not len(at):  # an empty line outside the axes would upset the layout
+        return False
+    above = {"transform": panel.get_xaxis_transform(), "clip_on": False}
+    panel.plot(at, np.full(len(at), 1.03 + 0.06 * row), color=color, **LOST_MARK, **above)
+    if row == 0:
+        place = {"transform": panel.transAxes, "ha": "right", "va": "center", "fontsize": 9, "color": MUTED}
+        panel.text(-0.02, 1.03, "lost", **place)
+    return True
+
+
+def _neighbours(panel, rows: pd.DataFrame, name: str, style: dict, log: bool) -> None:
     """Dots of one variant [%], and their means over neighbours where they are enough."""
-    at, values = errors.index.to_numpy(float), 100 * errors.to_numpy(float)
-    lost = ~(values <= LOST)
-    color = style["color"]
-    panel.plot(at[~lost], values[~lost], "o", ms=4.5, mfc="white", mec=color, mew=1.1, alpha=0.9)
-    if lost.any():  # an empty line outside the axes would upset the layout
-        above = {"transform": panel.get_xaxis_transform(), "clip_on": False, "label": "lost"}
-        panel.plot(at[lost], np.full(lost.sum(), 1.03), color=color, **_LOST, **above)
-    if len(at) < _FEWEST:
-        panel.plot([], [], "o", **{k: v for k, v in style.items() if k != "linestyle"})
+    dots = {"ls": "", "ms": 4.5, "mew": 1.1, "alpha": 0.9, "color": style["color"], "marker": style["marker"]}
+    few, shown = len(rows) < _FEWEST, rows[~rows["lost"]]
+    for beyond, part in shown.groupby("beyond"):
+        label = {"label": style["label"]} if few and not beyond else {}
+        face = style["color"] if beyond else "white"
+        panel.plot(part[name], 100 * part["error"], mfc=face, **dots, **label)
+    if few:
         return
-    values[lost] = np.nan  # a lost run leaves a gap: it is never averaged around
-    several = math.ceil(math.sqrt(len(at))) + 1
-    places, near = (np.lib.stride_tricks.sliding_window_view(v, several) for v in (at, values))
+    errors = 100 * rows["error"].mask(rows["lost"]).groupby(rows[name]).agg(whole_mean)  # a gap, in no mean
+    several = math.ceil(math.sqrt(len(errors))) + 1
+    places, near = (
+        np.lib.stride_tricks.sliding_window_view(v, several)
+        for v in (errors.index.to_numpy(float), errors.to_numpy(float))
+    )
     middle = np.exp(np.log(places).mean(1)) if log else places.mean(1)
-    band(panel, middle, near.mean(1), near.min(1), near.max(1), **style)
+    band(panel, middle, near.mean(1), near.min(1), near.max(1), **line(style))
 
 
 def _map(panel, view: View, cases: pd.DataFrame, names: list[str], scale: ScalarMappable) -> None:
-    lost = ~(100 * cases["error"] <= LOST)
     trained = view.trained.get(cases["scene"].iloc[0], ())
     crosses = np.array([[case[name] for name in names] for case in trained if case.keys() >= {*names}])
     panel.plot(*crosses.reshape(-1, 2).T, zorder=1, **_CROSS)
-    colors = scale.to_rgba(100 * cases["error"][~lost])
-    at = [cases[name] for name in names]
-    panel.scatter(*(v[~lost] for v in at), s=52, c=colors, edgecolors=INK, linewidths=0.8, zorder=2)
-    panel.plot(*(v[lost] for v in at), zorder=3, color=WARNING, **_LOST)
+    for beyond, part in cases[~cases["lost"]].groupby("beyond"):
+        face = {"c": scale.to_rgba(100 * part["error"]), "edgecolors": INK, "linewidths": 0.8}
+        panel.scatter(*(part[name] for name in names), s=52, marker="os"[beyond], zorder=2, **face)
+    panel.plot(*(cases[name][cases["lost"]] for name in names), zorder=3, color=WARNING, **LOST_MARK)
     for which, name in zip("xy", names, strict=True):
         _scaled(panel, which, cases, name, name in view.logarithmic)
     panel.margins(0.06)
@@ -169,6 +199,11 @@ def _colors(errors: pd.Series) -> ScalarMappable:
     shown = errors[(errors <= LOST) & (errors > 0)]
     low, high = (shown.min(), shown.max()) if len(shown) else (1.0, LOST)
     return ScalarMappable(LogNorm(low, max(high, 1.1 * low), clip=True), matplotlib.colormaps[COLORS])
+
+
+def _within(cases: pd.DataFrame) -> pd.Series:
+    """Errors of cases that led nowhere beyond what was taught; all where there are no others."""
+    return cases["error"][~cases["beyond"] | cases["beyond"].all()]
 
 
 def _summary(errors: pd.Series) -> str:

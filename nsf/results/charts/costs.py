@@ -1,13 +1,13 @@
 """Charts of costs: the time of a step, speedup and memory."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nsf.results.charts.drawing import ERROR, marks, row_names
+from nsf.results.charts.drawing import ERROR, mark, row_names, styles
 from nsf.results.charts.view import Figures, View, best_series, chart
 from nsf.results.columns import COLUMNS, RIVALS, column, number
 from nsf.results.style import (
@@ -15,10 +15,11 @@ from nsf.results.style import (
     INK,
     LOST,
     MUTED,
-    REDUCED,
+    RIVAL_COLORS,
     STAGE_TITLES,
     figure,
     legend,
+    model_color,
     panels,
     plain_ticks,
     stage_colors,
@@ -40,20 +41,20 @@ def error_over_cost(view: View) -> Figures:
     timed = view.averages[view.averages["step_ms"].notna()]
     if timed.empty:
         return {}
-    styles = marks(timed["variant"])
+    drawn_as = styles(timed, "variant")
     groups = list(timed.groupby("body", sort=False))
     fig, drawn = panels(len(groups), 3.1, 3)
     for panel, (body, part) in zip(drawn, groups, strict=True):
         for row in part.to_dict("records"):
             time = row["step_ms"] / _multiple(view, row)
-            _dot(panel, time, row["displacement_error"], **styles[row["variant"]])
+            _dot(panel, time, row["displacement_error"], **mark(drawn_as[row["variant"]]))
         panel.axvline(part["step_ms_full"].median(), color=FULL, lw=1.6, label="full order")
         coarse = [part[name].median() for name in ("step_ms_coarse", "displacement_coarse")]
         _dot(panel, *coarse, label=_COARSER, **_COARSE)
         everywhere = view.averages[view.averages["body"] == body]
         for name, ls in zip(RIVALS[:3], _LINES, strict=True):
             if math.isfinite(error := everywhere[name].min()):
-                panel.axhline(100 * error, color=MUTED, ls=ls, lw=1.2, label=COLUMNS[name].title)
+                panel.axhline(100 * error, color=RIVAL_COLORS[name], ls=ls, lw=1.4, label=COLUMNS[name].title)
         panel.set(xscale="log", yscale="log", title=body, xlabel=_SPAN, ylabel=ERROR)
         panel.margins(0.12)
         panel.set_ylim(top=min(panel.get_ylim()[1], LOST))
@@ -79,16 +80,18 @@ def speedup_and_memory(view: View) -> Figures:
     averages = view.averages[view.averages["speedup_step"].notna()].reset_index(drop=True)
     if averages.empty:
         return {}
-    fig = figure(1.7 + 0.5 * len(averages))
+    fig = figure(1.9 + 0.5 * len(averages))
     speed, memory = fig.subplots(1, 2, sharey=True)
-    colors = {"speedup_step": "#009E73", "speedup_total": "#CC79A7", "speedup_decoded": "#E69F00"}
-    _numbers(speed, averages, colors)
-    _numbers(memory, averages, {"memory_full_mib": FULL, "memory_mib": REDUCED})
+    colors = averages["model_name"].map(model_color)
+    _numbers(speed, averages, dict.fromkeys(("speedup_step", "speedup_total", "speedup_decoded"), colors))
+    _numbers(memory, averages, {"memory_full_mib": [FULL] * len(averages), "memory_mib": colors})
     speed.axvline(1, color=INK, lw=1, zorder=0.9)
     speed.set_xlabel("speedup over full order [×]")
     memory.set_xlabel("peak memory [MiB]")
     speed.set_yticks(np.arange(len(averages)), row_names(averages))
     speed.set_ylim(len(averages) - 0.4, -0.6)
+    for name, color in dict(zip(averages["model_name"], colors, strict=True)).items():
+        speed.plot([], [], "o", ms=6, color=color, label=name)
     legend(fig)
     return {"speedup-memory": fig}
 
@@ -103,7 +106,7 @@ def step_over_particles(view: View) -> Figures:
     if averages.empty:
         return {}
     groups = list(averages.groupby("scene", sort=False))
-    styles = marks(averages["model_name"])
+    drawn_as = styles(averages, "model_name")
     fig, drawn = panels(len(groups), 3.4, 2)
     for panel, (scene, part) in zip(drawn, groups, strict=True):
         full = part.groupby("particles")[["step_ms_full", "step_ms_coarse"]].median()
@@ -111,7 +114,7 @@ def step_over_particles(view: View) -> Figures:
         panel.plot(full.index, full["step_ms_coarse"], ms=5, **_COARSE, ls="--", label=_COARSER)
         for name, rows in part.groupby("model_name", sort=False):
             times = rows.groupby("particles")["step_ms"].median()
-            panel.plot(times.index, times, ms=5, **styles[name])
+            panel.plot(times.index, times, ms=5, **mark(drawn_as[name]))
         panel.set(xscale="log", yscale="log", title=scene, ylabel=_SPAN)
         panel.set_xlabel(COLUMNS["particles"].heading)
         panel.set_xticks(full.index, [f"{size:,.0f}" for size in full.index])
@@ -179,19 +182,24 @@ def _dot(panel, span: float, error: float, **style) -> None:
         panel.plot(span, 100 * error, ms=7, ls="", **style)
 
 
-def _numbers(panel, averages: pd.DataFrame, columns: Mapping[str, str]) -> None:
-    """Dots of each variant, a colour a column, each with its number beside it, on a logarithmic axis."""
+def _numbers(panel, averages: pd.DataFrame, columns: Mapping[str, Sequence[str]]) -> None:
+    """Marks of each variant, a shape a column, in the colours of its models, on a logarithmic axis.
+
+    Each has its number beside it: before it below 1, where a number behind it would lie on the line at 1.
+    """
     panel.set_xscale("log")
-    for k, (name, color) in enumerate(columns.items()):
+    for k, (name, colors) in enumerate(columns.items()):
         at = np.arange(len(averages)) + 0.72 * ((k + 0.5) / len(columns) - 0.5)
-        panel.plot(averages[name], at, "o", ms=6, color=color, label=column(name).title)
-        for x, y in zip(averages[name], at, strict=True):
+        panel.plot([], [], ls="", marker="o^s"[k], ms=6, color=MUTED, label=column(name).title)
+        for x, y, color in zip(averages[name], at, colors, strict=True):
             if math.isfinite(x):
+                panel.plot(x, y, "o^s"[k], ms=6, color=color)
                 place = {"textcoords": "offset points", "va": "center", "fontsize": 8.5}
-                place |= {"bbox": {"facecolor": "white", "linewidth": 0, "pad": 0.6}}  # over the line at 1×
-                panel.annotate(number(x), (x, y), (6, 0), **place)
+                place |= {"ha": "right" if x < 1 else "left"}
+                panel.annotate(number(x), (x, y), (-7 if x < 1 else 7, 0), **place)
     low, high = panel.get_xlim()
-    panel.set_xlim(low, high * (high / low) ** 0.16)  # room for the last numbers
+    room = (high / low) ** 0.2  # for the numbers at the ends
+    panel.set_xlim(low / room if averages[list(columns)].min(axis=None) < 1 else low, high * room)
     plain_ticks(panel.xaxis, "{:,g}".format)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)

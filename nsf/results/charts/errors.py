@@ -1,25 +1,26 @@
 """Charts of errors: at each program, of each variant, and over what a report varies."""
 
 import re
-import textwrap
-from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.data.case import PROGRAM
-from nsf.results.charts.drawing import ERROR, finite, lines, whole_mean
+from nsf.results.charts.drawing import ERROR, finite, in_lines, mark, row_panels, styles, whole_mean
 from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import COLUMNS, RIVALS, SEEDS, column
 from nsf.results.formats import file_name
 from nsf.results.style import (
     LOST,
+    LOST_MARK,
     MUTED,
     PAPER,
+    RIVAL_COLORS,
     band,
     error_scale,
     legend,
+    model_color,
     panels,
     plain_ticks,
 )
@@ -39,25 +40,22 @@ def programs(view: View) -> Figures:
     forced = view.frame[view.frame["case"].str.contains(f"{PROGRAM}=")]
     if forced.empty:
         return {}
-    groups, styles = list(forced.groupby("body", sort=False)), lines(forced["model_name"])
-    most = max(part["variant"].nunique() for _, part in groups) + len(RIVALS)
-    fig, drawn = panels(len(groups), max(3.0, 0.6 + 0.3 * most), 2)
+    groups = list(forced.groupby("body", sort=False))
+    counts = [part["variant"].nunique() + len(RIVALS) for _, part in groups]
+    fig, drawn = row_panels(counts, 0.32, 0.9)
     for panel, (body, part) in zip(drawn, groups, strict=True):
-        rows = {
-            name: _of_programs(one["displacement_error"], one)
-            for name, one in part.groupby("variant", sort=False)
-        }
-        models = len(rows)
-        rows |= {COLUMNS[name].title: _of_programs(part[name], part) for name in RIVALS}
-        every = np.concatenate(list(rows.values()))
-        error_scale(panel, every, "x")
-        model_of = part.drop_duplicates("variant").set_index("variant")["model_name"]
-        for y, (name, errors) in enumerate(rows.items()):
-            _dots(panel, y, errors, styles[model_of[name]]["color"] if name in model_of else MUTED)
-        panel.axhline(models - 0.5, color=MUTED, lw=0.8)
-        panel.set_yticks(range(len(rows)), ["\n".join(textwrap.wrap(name, 32)) for name in rows])
-        panel.set(title=body, xlabel=ERROR, ylim=(len(rows) - 0.45, -0.55))
-        panel.tick_params(axis="y", length=0)
+        variants_of = list(part.groupby("variant", sort=False))
+        rows = [
+            (name, _of_programs(one["displacement_error"], one), model_color(one["model_name"].iloc[0]))
+            for name, one in variants_of
+        ]
+        rows += [(COLUMNS[n].title, _of_programs(part[n], part), RIVAL_COLORS[n]) for n in RIVALS]
+        error_scale(panel, np.concatenate([errors for _, errors, _ in rows]), "x")
+        for y, (_, errors, color) in enumerate(rows):
+            _dots(panel, y, errors, color)
+        panel.axhline(len(variants_of) - 0.5, color=MUTED, lw=0.8)
+        panel.set_yticks(range(len(rows)), in_lines([name for name, *_ in rows], len(groups)))
+        panel.set(title=body, xlabel=ERROR)
     return {"programs": fig}
 
 
@@ -84,18 +82,13 @@ def _dots(panel, y: int, errors: np.ndarray, color: str) -> None:
 )
 def delta(view: View) -> Figures:
     """δ of every variant, and the paper's, a panel a body."""
-    styles = lines(view.averages["model_name"])
     groups = list(view.averages.groupby("body", sort=False))
-    most = max(len(averages) for _, averages in groups)
-    fig, drawn = panels(len(groups), 0.8 + 0.36 * most, 2, sharex=True)
+    fig, drawn = row_panels([len(averages) for _, averages in groups], 0.36, 0.8, sharex=True)
     every: list[float] = []
     for panel, (body, averages) in zip(drawn, groups, strict=True):
-        every += _deltas(panel, view.frame[view.frame["body"] == body], averages.reset_index(), styles)
-        panel.set_yticks(
-            range(len(averages)), _row_names(averages["variant"], 60 if len(groups) == 1 else 34)
-        )
-        panel.set(title=body, ylim=(most - 0.45, -0.55), xlabel=COLUMNS["delta"].heading)
-        panel.tick_params(axis="y", length=0)
+        every += _deltas(panel, view.frame[view.frame["body"] == body], averages.reset_index())
+        panel.set_yticks(range(len(averages)), in_lines(averages["variant"], len(groups)))
+        panel.set(title=body, xlabel=COLUMNS["delta"].heading)
         panel.tick_params(axis="x", labelbottom=True)
     for panel in drawn:
         error_scale(panel, every, "x")
@@ -105,30 +98,23 @@ def delta(view: View) -> Figures:
     return {"delta": fig}
 
 
-def _row_names(names: Iterable[str], width: int) -> list[str]:
-    """Names in lines; one of more letters than `width` has a line for each of its parts, or more."""
-
-    def lines_of(name: str) -> list[str]:
-        return [line for part in name.split(" · ") for line in textwrap.wrap(part, width)]
-
-    return [name if len(name) <= width else "\n".join(lines_of(name)) for name in names]
-
-
-def _deltas(panel, frame: pd.DataFrame, averages: pd.DataFrame, styles: dict[str, dict]) -> list[float]:
+def _deltas(panel, frame: pd.DataFrame, averages: pd.DataFrame) -> list[float]:
     """δ [%] of the variants of a body, a row each; gives all that is drawn."""
     at, average = np.arange(len(averages)), 100 * finite(averages["delta"])
     every = [*average, *(100 * averages["paper_delta"])]
     for y, row in averages.iterrows():
         values = 100 * finite(_of_each(frame[frame["variant"] == row["variant"]]))
-        style = styles[row["model_name"]]
+        color, name = model_color(row["model_name"]), row["model_name"]
         every += values.tolist()
-        panel.plot(values, np.full(len(values), y), "o", ms=4.5, mfc="white", mec=style["color"], mew=1.1)
+        panel.plot(values, np.full(len(values), y), "o", ms=4.5, mfc="white", mec=color, mew=1.1)
         if average[y] <= LOST:
-            place = {"color": style["color"], "label": style["label"], "lw": 2.4}
-            panel.plot([average[y]] * 2, [y - 0.3, y + 0.3], **place)
+            panel.plot([average[y]] * 2, [y - 0.3, y + 0.3], color=color, lw=2.4, label=name)
         else:
-            place = {"transform": panel.get_yaxis_transform(), "ha": "right", "fontsize": 9}
-            panel.text(1.0, y - 0.18, "diverged" if np.isnan(average[y]) else "lost", **place)
+            beside = {"transform": panel.get_yaxis_transform(), "clip_on": False}
+            panel.plot(1.02, y, color=color, **LOST_MARK, **beside)
+            place = {"textcoords": "offset points", "va": "center", "fontsize": 9, "color": MUTED}
+            text, at_cross = "diverged" if np.isnan(average[y]) else "lost", panel.get_yaxis_transform()
+            panel.annotate(text, (1.02, y), (6, 0), xycoords=at_cross, annotation_clip=False, **place)
     panel.plot(100 * averages["paper_delta"], at, "X", ms=8, color=PAPER, label="the paper")
     return every
 
@@ -168,16 +154,16 @@ def _over(frame: pd.DataFrame, key: str) -> Figure:
         frame = frame.assign(train_seconds=frame.groupby(["body", "variant"])[key].transform("mean"))
     by = "scene" if bound else "body"
     frame = frame.assign(line=variants(frame.assign(body=frame[by]), hidden))
-    styles = lines(frame["line"])
+    drawn_as = styles(frame, "line")
     groups = list(frame.groupby(by, sort=False))
     fig, drawn = panels(len(groups), 2.8, sharex=True)
     for panel, (body, part) in zip(drawn, groups, strict=True):
         every = []
-        for name, line in part.groupby("line", sort=False):
-            every += _dots_or_band(panel, line.groupby(key)["delta"], styles[name])
+        for name, of in part.groupby("line", sort=False):
+            every += _dots_or_band(panel, of.groupby(key)["delta"], drawn_as[name])
         if key == "training_runs":
             free = 100 * part.groupby(key)["delta_interpolated"].agg(whole_mean)
-            panel.plot(free.index, free, "s", ms=4, color=MUTED, label="interpolate")
+            panel.plot(free.index, free, "s", ms=4, color=model_color("interpolate"), label="interpolate")
         papers = part[[key, "paper_delta"]].dropna().drop_duplicates()
         if len(papers):
             panel.plot(papers[key], 100 * papers["paper_delta"], "X", ms=8, color=PAPER, label="the paper")
@@ -199,11 +185,11 @@ def _dots_or_band(panel, groups, style: dict) -> list[float]:
     if groups.size().max() <= _FEW:
         values = 100 * groups.apply(lambda one: pd.Series(finite(one))).dropna()
         at = values.index.get_level_values(0)
-        panel.plot(at, values, **style | {"linestyle": "", "marker": "o", "ms": 4.5, "mfc": "white"})
+        panel.plot(at, values, ls="", ms=4.5, mfc="white", **mark(style))
         return values.tolist()
     values = 100 * groups.agg(["min", "max", whole_mean])
     low, high, middle = (finite(values[of]) for of in ("min", "max", "whole_mean"))
-    band(panel, values.index, middle, low, high, **style | {"marker": "o", "ms": 4})
+    band(panel, values.index, middle, low, high, ms=4, **style)
     return [*low, *high]
 
 

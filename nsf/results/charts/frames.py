@@ -3,10 +3,10 @@
 import pandas as pd
 from matplotlib.ticker import MaxNLocator
 
-from nsf.results.charts.drawing import finite
+from nsf.results.charts.drawing import finite, line, styles
 from nsf.results.charts.view import Figures, View, best_series, chart
 from nsf.results.columns import axis, column
-from nsf.results.style import error_scale, legend, line_style, panels
+from nsf.results.style import error_scale, legend, panels
 from nsf.results.table import parameter
 
 _DASHED = (0, (2, 1.6))
@@ -59,9 +59,11 @@ def latent(view: View) -> Figures:
 
 def _frames(panel, series: pd.DataFrame, name: str, dashed: str, scale: float = 1.0, **width) -> None:
     """A column over time, a line a case, and another one dashed, where the series has it."""
-    for i, (case, part) in enumerate(series.groupby("case", sort=False)):
-        style, text = line_style(i), case.partition("=")[2] if case.count("=") == 1 else case
-        panel.plot(part["t"], finite(scale * part[name]), label=text, **style)
+    drawn = styles(series, "case")
+    for case, part in series.groupby("case", sort=False):
+        text = case.partition("=")[2] if case.count("=") == 1 else case
+        style = line(drawn[case]) | {"label": text}
+        panel.plot(part["t"], finite(scale * part[name]), **style)
         if dashed in part:
             faint = {"color": style["color"], "ls": _DASHED, "alpha": 0.5, **width}
             panel.plot(part["t"], scale * part[dashed], **faint)

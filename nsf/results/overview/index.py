@@ -13,7 +13,7 @@ from nsf.data import Trajectory, archives
 from nsf.deployment import Rollout
 from nsf.results.formats import HTML
 from nsf.results.overview.tables import Column, columns
-from nsf.results.style import FULL, PALETTE, REDUCED, figure, styled
+from nsf.results.style import FULL, PALETTE, figure, model_color, styled
 from nsf.runs import Run
 from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.storage import write_text, writing
@@ -22,6 +22,7 @@ _CHOSEN = ("stage", "scene", "status")
 
 _SIZE = (1.6, 1.0)  # [inch] at 100 dpi
 _POINTS = 1500
+_REDUCED = model_color("projected")
 
 
 def write_index(folder: Path, root: Path | None = None) -> Path:
@@ -121,13 +122,13 @@ def _deployed(ax: Axes, run: Run) -> None:
     """The first two latent coordinates of every reduced run."""
     for path in sorted(run.path.glob("rollout_*.h5")):
         xhat = Rollout.open(run.file(path.name)).xhat
-        ax.plot(xhat[:, 0], xhat[:, min(1, xhat.shape[1] - 1)], color=REDUCED, linewidth=1)
+        ax.plot(xhat[:, 0], xhat[:, min(1, xhat.shape[1] - 1)], color=_REDUCED, linewidth=1)
 
 
 def _evaluated(ax: Axes, run: Run) -> None:
     """The particles at the end, full-order and reduced, of the first value."""
     frames = archives.arrays(run.file("frames.npz"), "frames", "evaluate")
-    for name, color in (("x_full", FULL), ("x_reduced", REDUCED)):
+    for name, color in (("x_full", FULL), ("x_reduced", _REDUCED)):
         x = frames[name][0, -1]
         _scatter(ax, x[:: max(1, len(x) // _POINTS)], color)
 

@@ -8,7 +8,7 @@ import pytest
 from made import STAGES, Made, frame
 
 from nsf.results import style, table
-from nsf.results.charts import CHARTS, View, cases, errors
+from nsf.results.charts import CHARTS, View, cases, drawing, errors
 from nsf.results.charts import view as register
 
 PLANE = tuple(
@@ -81,6 +81,17 @@ def test_the_baseline_has_one_name_in_charts():
     panel = errors.delta(shown)["delta"].axes[0]
     names = [text.get_text() for text in panel.get_yticklabels()]
     assert names == ["deformation only (baseline)", "projected"]
+
+
+def test_a_model_has_one_colour_and_its_settings_have_shades_of_it():
+    assert len(set(style.MODEL_COLORS.values())) == len(style.MODEL_COLORS)
+    rows = table.labelled(table.complete(frame(Made(r=6), Made(r=8), Made(model="recurrence")), "here"))
+    of_models, of_variants = (drawing.styles(rows, by) for by in ("model_name", "variant"))
+    assert {name: one["color"].upper() for name, one in of_models.items()} == {
+        name: style.MODEL_COLORS[name].upper() for name in ("projected", "recurrence")
+    }
+    assert len({one["color"] for one in of_variants.values()}) == len(of_variants) == 3
+    assert style.model_color("a model of one's own") == style.model_color("a model of one's own")
 
 
 def test_a_chart_is_added_by_one_function(monkeypatch):

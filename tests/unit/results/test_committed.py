@@ -114,7 +114,7 @@ def test_a_row_that_was_changed_is_noticed_by_its_charts_and_page(folder):
 
 def test_a_chart_that_is_drawn_otherwise_is_noticed_and_drawn_again(folder, monkeypatch):
     before = (folder / "noise/weak/delta.png").read_bytes()
-    monkeypatch.setattr(style, "PALETTE", ("#00ff00",))
+    monkeypatch.setitem(style.MODEL_COLORS, "projected", "#00ff00")
     assert any("noise/weak/delta.png is not the chart" in fault for fault in faults(folder))
     committed.write_list(folder)
     assert faults(folder) == []
