@@ -8,11 +8,10 @@ a chain whose results are all there, takes a second or two.
 """
 
 from collections.abc import Callable, Sequence
-from copy import copy
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -22,22 +21,16 @@ from nsf.errors import MissingRunError
 from nsf.models import Auto, Model
 from nsf.models.drawn import Drawn
 from nsf.paths import option
-from nsf.pipeline import naming
+from nsf.pipeline import naming, reuse, solvers
 from nsf.pipeline.configured import Configured
 from nsf.pipeline.durations import measured
+from nsf.pipeline.reuse import question_of
 from nsf.pipeline.tracking import Tracked
 from nsf.progress import START, timed
 from nsf.results.folder import check_place
-from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.scenes.designs import random_cases
-
-if TYPE_CHECKING:
-    from nsf.dynamics import ReducedBatch, ReducedMPM
-    from nsf.engines import Engine
-    from nsf.kinematics.manifold import Manifold
-    from nsf.recurrence import RecurrenceEngine
 
 #: Of the chain, in order.
 STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
@@ -233,48 +226,11 @@ class Pipeline(Configured):
         """The runs from which the chain makes others: trajectories, the manifold, encoded runs, a fit."""
         return [run for stage in ("simulate", "train", "encode", "teach") for run in self.runs_of(stage)]
 
-    def evaluated(self, stage: str = "evaluate") -> Run:
-        """The complete run of a stage, of this device or another: it may have been brought here.
-
-        Raises:
-            MissingRunError: there is none; says how far it came.
-        """
-        for device in (self.device, "cuda:0", "cpu"):
-            there = copy(self)
-            there.device = device
-            (run,) = there.runs_of(stage)
-            if run.complete:
-                return run
-        return self.runs_of(stage)[0].require()
-
-    def complete(self, stages: Sequence[str]) -> bool:
-        """Whether some stages have nothing to do."""
-        later = [stage for stage in stages if stage != "simulate"]
-        if "simulate" in stages:
-            spare = self.spare(later) if later else set()
-            if not all(run.complete or run.id in spare for run in self.runs_of("simulate")):
-                return False
-        if not all(run.complete for stage in later if stage != "report" for run in self.runs_of(stage)):
-            return False
-        return "report" not in stages or self.kept_report() is not None
-
-    def spare(self, later: Sequence[str]) -> set[str]:
-        """Trajectories, by id, that later stages need not read, as their results are there."""
-        truths = {self.truth(case).id for case in self.held_out}
-        read = [run for name in ("evaluate", "superresolve") if name in later for run in self.runs_of(name)]
-        over = "evaluate" in later and all(run.complete for run in read)
-        trained = {run.id for run in self.training_data}
-        needed = (set() if over else truths) | (set() if self.training.complete else trained)
-        return (truths | trained) - needed
-
-    def reported(self) -> list[Run]:
-        """Every evaluated variant of this scene at these held-out trajectories."""
-        truths = {self.truth(case).id for case in self.held_out}
-        return [
-            run
-            for run in Run.find("evaluate", self.scene.name, root=self.root)
-            if run.complete and truths == {p for p in run.parents if p.startswith("simulate/")}
-        ]
+    evaluated = reuse.evaluated
+    complete = reuse.complete
+    spare = reuse.spare
+    reported = reuse.reported
+    kept_report = reuse.kept_report
 
     @property
     def report_folder(self) -> Path:
@@ -389,18 +345,9 @@ class Pipeline(Configured):
         from nsf.results.report import build_report
 
         with measured(self, "report"):
-            page = build_report(runs, self.report_folder, self._question, first=self.evaluation)
+            page = build_report(runs, self.report_folder, question_of(self), first=self.evaluation)
         self.say(f"{said} → {page}")
         return page
-
-    def kept_report(self) -> Path | None:
-        """The page of the report, if nothing that it shows has changed since it was written."""
-        runs = self.reported()
-        return unchanged(self.report_folder, runs, self._question, self.evaluation) if runs else None
-
-    @property
-    def _question(self) -> Question:
-        return Question(self.config.report.name, self.config.scene.title)
 
     def _made(self, run: Run, work: str) -> Run:
         """The run, made here unless it is there or another process makes it meanwhile.
@@ -426,89 +373,8 @@ class Pipeline(Configured):
 
     # -- reduced solvers ---------------------------------------------------------------------------------
 
-    def manifold(self) -> "Manifold":
-        """The trained manifold.
-
-        Raises:
-            MissingRunError: it is not trained.
-        """
-        from nsf.kinematics.fields.mlp import MlpField
-        from nsf.kinematics.manifold import Manifold
-
-        manifold = Manifold.load(self.training.require().file("manifold.pt"))
-        if isinstance(self.field, MlpField):
-            manifold.arithmetic = self.field.arithmetic
-        return manifold
-
-    def solver_at(
-        self,
-        manifold: "Manifold",
-        case: Case,
-        device: str | None = None,
-        precision: str | None = None,
-        engine: "str | Engine | None" = None,
-    ) -> "ReducedMPM":
-        """The reduced solver of a case, at t = 0; device, precision and model as configured."""
-        return self.batch_at(manifold, [case], device, precision, engine).runs[0]
-
-    def batch_at(
-        self,
-        manifold: "Manifold",
-        cases: Sequence[Case],
-        device: str | None = None,
-        precision: str | None = None,
-        engine: "str | Engine | None" = None,
-        scene: Scene | None = None,
-    ) -> "ReducedBatch":
-        """Reduced runs of several cases that take their steps together, likewise.
-
-        By the configured model, of the scene that is deployed, unless an engine or a scene is given.
-        """
-        from nsf.engines import moves_particles, reduced_batch
-
-        if engine is None:
-            engine = self.model.engine(self, manifold)
-        batch = reduced_batch(
-            scene or self.deployed,
-            manifold,
-            cases,
-            self._samples or self.sampler,
-            engine=engine,
-            sources=self.sources,
-            projector=self.projector,
-            integration=self.integration,
-            precision=precision or self.config.precision,
-            device=device or self.device,
-            dt_multiplier=self.config.deploy.dt_multiplier,
-            # As the sample, these depend on the manifold and the sampler alone: found once for all cases.
-            sets=self._sets if moves_particles(engine) else None,
-        )
-        self._samples = batch.batch.shared.samples
-        if moves_particles(engine):
-            self._sets = batch.batch.shared.sets
-        return batch
-
-    def recurrence(self) -> "RecurrenceEngine":
-        """The recurrence that was taught.
-
-        Raises:
-            MissingRunError: none was.
-        """
-        if self._taught is None:
-            from nsf.pipeline.stages.teaching import RECURRENCE
-            from nsf.recurrence import RecurrenceEngine
-
-            self._taught = RecurrenceEngine.load(self.taught.require().file(RECURRENCE))
-        return self._taught
-
-    def fitted(self, manifold: "Manifold") -> Any:
-        """The fit of a model of latent vectors, from its file where it learns.
-
-        Raises:
-            MissingRunError: it was not taught.
-        """
-        if self._fitted is None:
-            from nsf.pipeline.stages.teaching import fitted, loaded
-
-            self._fitted = loaded(self.taught) if self.model.learns else fitted(self, manifold)
-        return self._fitted
+    manifold = solvers.manifold
+    solver_at = solvers.solver_at
+    batch_at = solvers.batch_at
+    recurrence = solvers.recurrence
+    fitted = solvers.fitted
