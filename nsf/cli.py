@@ -349,7 +349,7 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
 def _show(page, table: bool = True) -> None:
     """The result table of a report, on the terminal, and where its page is."""
     if table:
-        from nsf.results.table import console_table
+        from nsf.results.averages import console_table
 
         screen().print(console_table(page.parent / "results.csv"))
     from nsf.progress import slowest_stage

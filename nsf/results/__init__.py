@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
+    from nsf.results.averages import means
     from nsf.results.columns import COLUMNS
-    from nsf.results.table import labelled, means, query, read
+    from nsf.results.table import labelled, query, read
 
 __all__ = ["COLUMNS", "labelled", "means", "query", "read"]
 

@@ -9,9 +9,10 @@ import pandas as pd
 
 from nsf.bodies.colors import STRESS_COLORS
 from nsf.results import pictures
+from nsf.results.averages import rows_of
 from nsf.results.sources import Source
 from nsf.results.style import PIXELS, write_png
-from nsf.results.table import labelled, rows_of
+from nsf.results.table import labelled
 from nsf.runs import Run
 
 _EACH = (

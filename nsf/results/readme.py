@@ -7,6 +7,7 @@ import pandas as pd
 
 from nsf.errors import ConfigError
 from nsf.results import table
+from nsf.results.averages import means
 from nsf.results.columns import number
 
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
@@ -50,7 +51,7 @@ def _means(frame: pd.DataFrame, report: str, model: str) -> pd.DataFrame:
     rows = table.labelled(table.query(frame, report=report, model=model))
     if "model.runs" in rows:
         rows = rows[rows["model.runs"] == rows["model.runs"].max()]
-    return table.means(rows, ("body",)).set_index("body")
+    return means(rows, ("body",)).set_index("body")
 
 
 def updated(text: str, frame: pd.DataFrame) -> str:

@@ -16,6 +16,7 @@ from nsf.errors import ConfigError
 from nsf.manifest import digest
 from nsf.progress import Progress
 from nsf.results import table
+from nsf.results.averages import SAID_ONCE, averaged, constants, rows_of, where_rivals_win, with_intervals
 from nsf.results.charts import CHARTS, View
 from nsf.results.charts.bounds import BAD, GOOD, judged, promise
 from nsf.results.charts.cases import COLORS
@@ -241,13 +242,13 @@ def write_pages(
         more: tables after the first.
         warnings: of its simulations.
     """
-    averages = table.with_intervals(table.averaged(view.frame), view.frame)
+    averages = with_intervals(averaged(view.frame), view.frame)
     names = [name for name in _MEANS if name not in ("variant", "body") or averages[name].nunique() > 1]
-    shown = table.rows_of(averages, [name for name in names if name != "case" or "case" in averages])
-    once = table.constants(view.frame, (*table.SAID_ONCE, "body"))
+    shown = rows_of(averages, [name for name in names if name != "case" or "case" in averages])
+    once = constants(view.frame, (*SAID_ONCE, "body"))
     said = ", ".join(f"{title} {text}" for title, text in once.items())
     first = Table("Results", shown, " ".join([_averages_of(view.frame), *findings(view)]))
-    each = table.rows_of(view.frame, _EACH)
+    each = rows_of(view.frame, _EACH)
     headings = {*shown.headings, *each.headings, *(name for one in more for name in one.content.headings)}
     used = [name for name, column in {**COLUMNS, **DERIVED}.items() if column.heading in headings]
     page = Page(
@@ -286,7 +287,7 @@ def _fine_tables(frame: pd.DataFrame, question: Question, folder: Path) -> list[
     fine.map(spreadsheet).to_csv(folder / _FINE, index=False)
     shown = [name for name in fine if name in COLUMNS or name in DERIVED]
     note = "The fields at the points, beside a full-order run of as many particles on the same grid."
-    return [Table("At many more points", table.rows_of(fine, [n for n in shown if n != "run"]), note)]
+    return [Table("At many more points", rows_of(fine, [n for n in shown if n != "run"]), note)]
 
 
 def findings(view: View) -> list[str]:
@@ -297,7 +298,7 @@ def findings(view: View) -> list[str]:
     if len(compared):
         below = int((compared["delta"] < compared["paper_delta"]).sum())
         sentences.append(f"δ is below the paper's in {below} of {len(compared)} rows that it prints.")
-    if won := table.where_rivals_win(averages):
+    if won := where_rivals_win(averages):
         sentences.append(won)
     if lost := int(np.isinf(frame["delta"]).sum()):
         sentences.append(f"∞: {lost} of {len(frame)} runs diverged.")
@@ -377,7 +378,7 @@ def _bounds(frame: pd.DataFrame) -> list[Table]:
         return []
     off = f"more than {100 * BAD:.0f} % off; false alarms: red, and less than {100 * GOOD:.0f} % off."
     note = f"Missed: green, and {off}"
-    return [Table("Error bounds", table.rows_of(promise(frame), list(promise(frame))), note)]
+    return [Table("Error bounds", rows_of(promise(frame), list(promise(frame))), note)]
 
 
 def _warnings(sources: Sequence[Source]) -> list[str]:

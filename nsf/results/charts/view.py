@@ -10,9 +10,9 @@ from functools import cached_property
 import pandas as pd
 from matplotlib.figure import Figure
 
+from nsf.results.averages import means
 from nsf.results.formats import file_name
 from nsf.results.style import styled
-from nsf.results.table import means
 
 Figures = Mapping[str, Figure]
 

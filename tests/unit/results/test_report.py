@@ -10,10 +10,10 @@ from made import Made, rewrite, seal, write_run
 
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.results import pictures, table
+from nsf.results.averages import interval
 from nsf.results.question import Question, unchanged
 from nsf.results.report import build_report
 from nsf.results.sources import open_sources
-from nsf.results.table import interval
 
 ASKED = Question(
     "trial", "Sand & <friends>", "How far?", "Table 1: 0.4 %.", missing=["seed=2: not run"], plots=["delta"]

@@ -9,6 +9,7 @@ from made import Made, frame
 
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.results import table
+from nsf.results.averages import DEVIATION, SAID_ONCE, constants, means, where_rivals_win
 from nsf.results.columns import BASELINE, COLUMNS, number
 from nsf.results.formats import Rows, TerminalTable
 
@@ -18,30 +19,30 @@ def rows(*runs: Made, **columns) -> pd.DataFrame:
 
 
 def test_a_mean_is_over_cases_and_a_deviation_over_seeds():
-    averages = table.means(rows(Made((0.01, 0.03)), Made((0.03, 0.05), seed=1)))
+    averages = means(rows(Made((0.01, 0.03)), Made((0.03, 0.05), seed=1)))
     assert len(averages) == 1
     row = averages.iloc[0]
     assert row["delta"] == pytest.approx(0.03)
-    assert row[f"delta{table.DEVIATION}"] == pytest.approx(0.02 / math.sqrt(2))  # of 0.02 and 0.04
+    assert row[f"delta{DEVIATION}"] == pytest.approx(0.02 / math.sqrt(2))  # of 0.02 and 0.04
     assert (row["cases"], row["displacement_worst"]) == (4, 0.5)
 
 
 def test_gamma_is_the_papers():
-    cake = table.means(rows(Made((0.01,), cases=("angle=14°",)), particles=200_000, r=6)).iloc[0]
+    cake = means(rows(Made((0.01,), cases=("angle=14°",)), particles=200_000, r=6)).iloc[0]
     assert cake["gamma"] == 1e5  # 3 · 200,000 / 6, where the paper prints 1e6
 
 
 def test_speedups_are_of_mean_times_and_decoding_counts():
     slow = frame(Made((0.01,), cases=("friction_angle=26°",))).assign(step_ms=12.0, case="friction_angle=28°")
     both = pd.concat([frame(Made((0.01,), cases=("friction_angle=26°",))), slow])
-    row = table.means(table.labelled(table.complete(both, "here"))).iloc[0]
+    row = means(table.labelled(table.complete(both, "here"))).iloc[0]
     assert row["speedup_step"] == pytest.approx(6.0 / 6.75)
     assert row["speedup_decoded"] == pytest.approx(60.0 / 20.0)
 
 
 def test_a_run_that_diverged_makes_the_mean_infinite_and_a_missing_one_leaves_it_empty():
-    assert table.means(rows(Made((0.01, math.inf))))["delta"].iloc[0] == math.inf
-    assert math.isnan(table.means(rows(Made((0.01, math.nan))))["delta"].iloc[0])
+    assert means(rows(Made((0.01, math.inf))))["delta"].iloc[0] == math.inf
+    assert math.isnan(means(rows(Made((0.01, math.nan))))["delta"].iloc[0])
 
 
 def test_rivals_as_delta_take_the_ratio_of_both_errors():
@@ -63,7 +64,7 @@ def test_programs_beyond_what_was_taught_are_a_row_of_their_own():
     cases, models = ("E=5 Pa, program=0", "E=6 Pa, program=1"), ("projected", "recurrence")
     made = frame(*(Made((0.01, 9.0), cases, model=model) for model in models))
     shown = table.labelled(table.complete(made, "here").assign(beyond=[0, 0, 0, 1]))
-    averages = table.means(shown).set_index("variant")
+    averages = means(shown).set_index("variant")
     assert averages["cases"].tolist() == [1] * 4
     for model in models:
         assert averages["delta"][model] == 0.01
@@ -78,10 +79,10 @@ def test_a_body_has_its_material_or_size_where_a_scene_has_several():
 
 def test_what_never_changes_is_said_once():
     shown = rows(Made(), Made(model="recurrence"))
-    assert table.constants(shown, ("field", "model", "r")) == {"field": "basis", "r": "6"}
+    assert constants(shown, ("field", "model", "r")) == {"field": "basis", "r": "6"}
     baseline = rows(Made(), Made(stress="deformation", affine="none"))
-    assert {"model", "stress", "affine"}.isdisjoint(table.constants(baseline, table.SAID_ONCE))
-    assert table.constants(rows(Made()), table.SAID_ONCE)["model"] == "projected"
+    assert {"model", "stress", "affine"}.isdisjoint(constants(baseline, SAID_ONCE))
+    assert constants(rows(Made()), SAID_ONCE)["model"] == "projected"
 
 
 def test_a_table_survives_its_file(tmp_path):
@@ -111,12 +112,12 @@ def test_a_file_that_is_no_table_is_refused(tmp_path):
 
 
 def test_where_rivals_win():
-    won = table.where_rivals_win(table.means(rows(Made((0.01, 0.01)))))
+    won = where_rivals_win(means(rows(Made((0.01, 0.01)))))
     assert won == (
         "A rival has a smaller displacement error than the best model: on sand interpolated latents (5 %) "
         "beside 10 %."
     )
-    assert table.where_rivals_win(table.means(rows(Made((0.001, 0.001))))).startswith("No rival")
+    assert where_rivals_win(means(rows(Made((0.001, 0.001))))).startswith("No rival")
 
 
 def test_every_column_has_a_meaning_and_measured_ones_a_unit():

@@ -8,8 +8,6 @@ own and are listed.
 """
 
 import hashlib
-import html
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -27,8 +25,8 @@ from nsf.results import report, table
 from nsf.results.charts import CHARTS, View
 from nsf.results.charts.cases import COLORS
 from nsf.results.columns import COLUMNS
-from nsf.results.folder import ANY, COMMITTED, MARK, PROVENANCE, RECORD, read
-from nsf.results.formats import Rows, markdown_document
+from nsf.results.committed.contents import INDEX, listed, page_of
+from nsf.results.folder import COMMITTED, MARK, PROVENANCE, RECORD, read
 from nsf.results.page import Picture, Section
 from nsf.results.question import Question
 from nsf.results.style import fingerprint, save
@@ -36,13 +34,7 @@ from nsf.runs.provenance import not_ignored
 from nsf.schemas import Maybe
 from nsf.storage import write_json, write_text
 
-TABLE, LIST, CONTENTS = "results.csv", "index.md", "contents.yaml"
-_COLUMNS = (
-    *("body", "variant", "case", "paper_delta", "delta", "displacement_error", "displacement_interpolated"),
-    *("speedup_decoded", "stress_error"),
-)
-_WIDE, _LONG = 7, 14  # columns and rows of a table of the page
-_EXPLAINED = ("delta", "displacement_error", "stress_error", "displacement_interpolated")
+TABLE, CONTENTS = "results.csv", "contents.yaml"
 _MADE_ANEW = (".gif", ".html", ".mp4", ".svg", ".tex")  # of a report, and not committed
 _REBUILD = "build it again with `nsf report`"
 
@@ -51,11 +43,6 @@ _CONTENTS = {
     Maybe("note"): str,
     Maybe("chapters"): {...: [str]},
     Maybe("paper"): {...: {"shows": str, "here": [str]}},
-}
-#: Of the record of a report that has files of its own.
-_LISTED = ANY | {
-    Maybe("chart"): ({"file": str}, None),
-    "listed": {"headings": [str], "body": [[str]], "numeric": [bool], "made": str},
 }
 
 
@@ -205,7 +192,7 @@ def write_list(folder: Path, pages: bool = False, questions: Mapping[str, Mappin
         records = {name: {**reports.records[name], "charts": _drawn(reports, name)} for name in reports.names}
         reports = replace(reports, records=records)
         reports.save()
-    return write_text(folder / LIST, _page(reports))
+    return write_text(folder / INDEX, page_of(reports))
 
 
 def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list[str]:
@@ -221,7 +208,7 @@ def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list
     """
     reports = Reports.of(folder, questions)
     again = f"write it with `nsf reports folder={folder}`"
-    differing = [fault for mark in _listed(folder) for fault in _changed(mark.parent)]
+    differing = [fault for mark in listed(folder) for fault in _changed(mark.parent)]
     for name, record in reports.records.items():
         differing += _altered(folder / name, record["files"])
     for name in reports.names:
@@ -236,8 +223,8 @@ def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list
     for path in sorted(drawn.keys() | seals.keys()):
         if path not in drawn or seals.get(path) != _seal(drawn[path], folder / path):
             differing.append(f"{folder / path} is not the chart of {folder / TABLE}; {again}")
-    page = folder / LIST
-    if not page.is_file() or page.read_text(encoding="utf-8") != _page(reports):
+    page = folder / INDEX
+    if not page.is_file() or page.read_text(encoding="utf-8") != page_of(reports):
         differing.append(f"{page} does not list the reports as they are; {again}")
     return differing
 
@@ -281,85 +268,6 @@ def _write_pages(reports: Reports, name: str) -> None:
     report.write_pages(question, place, sections, runs, view)
 
 
-def _page(reports: Reports) -> str:
-    """The text of `index.md`."""
-    chapters: dict[str, list[dict]] = {heading: [] for heading in reports.contents["chapters"]}
-    for name in reports.names:
-        chapters[reports.place(name)[1]].append(_section(reports, name))
-    for entry in (*map(_listed_section, _listed(reports.folder)), *map(_bench, _benches(reports.folder))):
-        chapters[list(chapters)[-1]].append(entry)
-    pictures = {f"{name}/{one.files[-1]}" for name in reports.names for one in reports.drawn(name)}
-    pictures |= reports.seals.keys()
-    figures = [
-        (figure, entry["shows"], [path for path in entry["here"] if path in pictures])
-        for figure, entry in reports.contents["paper"].items()
-    ]
-    return markdown_document(
-        "list.md",
-        note=reports.contents["note"],
-        chapters={heading: entries for heading, entries in chapters.items() if entries},
-        definitions=report.definitions(_EXPLAINED),
-        of_the_paper=figures if any(paths for *_, paths in figures) else [],
-    )
-
-
-def _section(reports: Reports, name: str) -> dict:
-    """One report on the page."""
-    view = reports.views[name]
-    averages, said = table.averaged(view.frame), []
-    if len(averages) > _LONG:
-        averages = averages.loc[sorted(averages.groupby("body", sort=False)["delta"].idxmin().dropna())]
-        said.append("The best of each scene.")
-    if averages["variant"].nunique() == 1:
-        said.append(f"Model: {averages['model_name'].iloc[0]}.")
-    varying = [c for c in _COLUMNS if c != "variant" or averages[c].nunique() > 1]
-    names = [c for c in varying if c in averages and not averages[c].isna().all()][:_WIDE]
-    files = list(reports.records[name]["charts"])
-    first = next((file for file in files if file.startswith("delta-over")), files[0] if files else "")
-    return {
-        "name": name,
-        "title": reports.question(name).title,
-        "table": table.rows_of(averages, names),
-        "said": " ".join([*said, *report.findings(view)[:1]]),
-        "chart": first,
-        "more": [file for file in [*files, *(p.files[-1] for p in reports.drawn(name))] if file != first],
-        "made": _made(reports, name),
-    }
-
-
-def _made(reports: Reports, name: str) -> str:
-    """How many runs, on what, at which scale and commit."""
-    rows, origins = reports.rows(name), reports.records[name]["runs"]
-    runs = [origins.get(run, {}) for run in rows["run"].unique()]
-    scales = " and ".join(sorted({str(run["scale"]) for run in runs if run.get("scale")}))
-    commits = ", ".join(sorted({report.commit_text(run) for run in runs}))
-    devices = sorted({re.sub(r"^NVIDIA | \d+GB.*", "", device) for device in rows["device"]})
-    return f"{len(runs)} run{'s' * (len(runs) > 1)}, {scales} scale, {', '.join(devices)}, {commits}"
-
-
-def _listed(folder: Path) -> Iterator[Path]:
-    """Marks of reports that have files of their own, as of inverse problems."""
-    for mark in not_ignored(sorted(folder.rglob(MARK))):
-        if "listed" in read(mark):
-            yield mark
-
-
-def _listed_section(mark: Path) -> dict:
-    """A report that has its files, on the page: its first table, as its `sources.json` has it."""
-    content = read(mark, _LISTED)
-    rows = content["listed"]
-    wide = [text[:_WIDE] for text in rows["body"]]
-    return {
-        "name": mark.parent.name,
-        "title": content["title"],
-        "table": Rows(rows["headings"][:_WIDE], wide, rows["numeric"][:_WIDE]),
-        "said": "",
-        "chart": (content.get("chart") or {}).get("file", ""),
-        "more": [LIST],
-        "made": rows["made"].rstrip("."),
-    }
-
-
 def _changed(folder: Path) -> list[str]:
     """Files of such a report that are not those whose hashes it holds."""
     recorded = read(folder / MARK)["files"]
@@ -378,25 +286,3 @@ def _altered(folder: Path, recorded: Mapping[str, str]) -> Iterator[str]:
             yield f"{folder / name} is missing; {_REBUILD}"
         elif digest(folder / name) != sha256:
             yield f"{folder / name} was changed; {_REBUILD}"
-
-
-def _benches(folder: Path) -> list[Path]:
-    """Folders that `nsf bench` wrote."""
-    return [mark.parent for mark in not_ignored(sorted(folder.glob("*/bench.csv")))]
-
-
-def _bench(folder: Path) -> dict:
-    """Benchmarks on the page: their title and first chart."""
-    text = (folder / LIST).read_text(encoding="utf-8")
-    chart = re.search(r"^!\[.*\]\(([\w-]+\.png)\)$", text, re.MULTILINE)
-    rows = table.parsed(folder / "bench.csv", ())
-    devices, commits = (", ".join(sorted(rows[name].astype(str).unique())) for name in ("device", "commit"))
-    return {
-        "name": folder.name,
-        "title": html.unescape(text.partition("\n")[0].removeprefix("# ")),
-        "table": None,
-        "said": "",
-        "chart": chart[1] if chart else "",
-        "more": [LIST],
-        "made": f"{len(rows)} rows, {devices}, {commits}",
-    }
