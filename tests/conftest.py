@@ -69,6 +69,14 @@ def garbage_stays():
 
 
 @pytest.fixture(scope="session", autouse=True)
+def unflushed_files():
+    """Files of tests need not survive the machine: waiting for the disk takes a fifth of a chain's time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nsf.storage._flush", lambda path: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def coarse_pictures():
     """A quarter of the pixels an inch, and one sample a pixel: a picture takes a sixth of the time."""
     from nsf.bodies import camera
