@@ -136,10 +136,10 @@ class Decoded(WholeRun):
     def run(self) -> None:
         """Take every step and decode every frame."""
         super().run()
-        if self._trust is not None:
-            self.verdict = self._trust.of_run(self.solver, self._trust.signal_of(self.solver))
         for _ in self._at.positions(self.solver.record.xhat, self._tolerance):
             pass
+        if self._trust is not None:  # on the host, while a GPU decodes
+            self.verdict = self._trust.of_run(self.solver, self._trust.signal_of(self.solver))
 
     def positions_after(self, steps: Sequence[int]) -> list[torch.Tensor]:
         """Positions [P, 3] [m] after some numbers of steps, in fp64 on the host."""

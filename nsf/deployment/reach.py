@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -64,14 +65,24 @@ class Band:
         half = 0.5 * float(np.linalg.norm(self.high - self.low))
         return np.linalg.norm(self._beyond(rows), axis=-1) / (half or 1.0)
 
+    def passed(self, rows: np.ndarray) -> bool:
+        """Whether a number of rows [N, f] is further beyond its range than the leeway."""
+        return bool(len(rows)) and bool((self.each(np.stack([rows.min(0), rows.max(0)])) > self.leeway).any())
+
     def _beyond(self, rows: np.ndarray) -> np.ndarray:
-        off = np.maximum(self.low - self._slack - rows, rows - self.high - self._slack)
+        low, high = self._ends
+        off = np.maximum(low - rows, rows - high)
         return np.where(np.isnan(off), np.inf, np.maximum(off, 0.0))
 
-    @property
+    @cached_property
     def _slack(self) -> np.ndarray:
         """[f] what round-off may move the numbers by."""
         return _ROUND_OFF * np.maximum(np.abs(self.low), np.abs(self.high))
+
+    @cached_property
+    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """[f] and [f] lowest and highest numbers that are not beyond."""
+        return self.low - self._slack, self.high + self._slack
 
     def plain(self) -> dict:
         """Plain containers."""
@@ -177,7 +188,7 @@ class Reach:
         away = float(np.linalg.norm(np.asarray(gravity) - self.gravity, axis=-1).max(initial=0.0))
         if away > self.radius + _ROUND_OFF * (self.radius + float(np.linalg.norm(self.gravity))):
             return f"gravity is {away:.3g} m/s² from that which was taught, {self.radius:.3g} m/s² at most"
-        if self.solids is not None and (self.solids.each(velocities(solids, dt)) > self.solids.leeway).any():
+        if self.solids is not None and self.solids.passed(velocities(solids, dt)):
             return "a solid is where, or as fast as, no program of training moves it"
         return ""
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -153,6 +154,7 @@ class Trust:
         self.metric, self.limit, self.reach, self.calibration = metric, limit, reach, calibration
         self.validated = np.zeros((0, 0)) if validated is None else validated
         self._taught = taught
+        self._forced = WeakKeyDictionary()  # of runs, by version of their forcing and index: see `_acting`
 
     @classmethod
     def of(cls, manifold, limit: float, *further) -> "Trust":
@@ -223,18 +225,34 @@ class Trust:
         return _finite(off)
 
     def signal_of(self, run: ReducedMPM, first: int = 0) -> np.ndarray:
-        """`signal` of a run from a step up to now."""
-        members, residuals = run.members, None
+        """`signal` of a run from a step up to now; linear between strides of members."""
+        members, steps = run.members, np.arange(first, run.steps_taken + 1)
+        if members is not None:
+            at_strides = self.signal(members[0], members)
+            return np.interp(steps, run.span.stride * np.arange(len(at_strides)), at_strides)
+        residuals = None
         if not run.span.latent_only:
             residuals = np.concatenate([[0.0], run.trajectory().residuals[:, -1]])[first:]
-        return self.signal(run.latents[first:], None if members is None else members[:, first:], residuals)
+        return self.signal(run.latents[first:], None, residuals)
 
     def outside(self, run: ReducedMPM, first: int = 1) -> str:
         """Why the inputs of a run, in its steps from one on, are outside of what was taught; empty if not."""
-        steps, dt = run.steps_taken, run.together.dt
-        solids = collider_states(run.together.batch.forcing.colliders_of(run.index), dt, steps)[first - 1 :]
-        gravity = run.acting_gravity(dt * np.arange(first - 1, steps))
-        return self.reach.of_inputs(run.setup.values, gravity, solids, dt) if self.reach else ""
+        if self.reach is None:
+            return ""
+        acting = (values[first - 1 : run.steps_taken] for values in self._acting(run))
+        return self.reach.of_inputs(run.setup.values, *acting, run.dt)
+
+    def _acting(self, run: ReducedMPM) -> tuple[np.ndarray, np.ndarray]:
+        """Gravity [N, 3] [m/s²] and states of the colliders [N, f] at every step, until a hand acts."""
+        forcing, steps = run.together.batch.forcing, run.total_steps
+        version, acting = self._forced.setdefault(run.together, (forcing.version, {}))
+        if version != forcing.version:
+            acting = {}
+            self._forced[run.together] = forcing.version, acting
+        if run.index not in acting:
+            solids = collider_states(forcing.colliders_of(run.index), run.dt, steps)
+            acting[run.index] = run.acting_gravity(run.dt * np.arange(steps)), solids
+        return acting[run.index]
 
     def of_run(self, run: ReducedMPM, signal: np.ndarray, diverged: int = -1) -> Verdict:
         """The verdict on a run, at its end or in its midst.
@@ -266,12 +284,13 @@ class Trust:
             diverged: step at which it diverged; −1: at none.
             whole: whether it is at its end; else errors are shares of what validation runs move at least.
         """
-        lost = diverged if diverged >= 0 else len(t)
-        finite = np.isfinite(xhat).all(-1) & (np.arange(len(t)) < lost)
-        displacement = float(rms(self.moved(np.where(finite[:, None], xhat, xhat[:1]))))
+        finite = np.isfinite(xhat).all(-1)
+        finite[diverged if diverged >= 0 else len(t) :] = False
+        rows = np.where(finite[:, None], xhat, xhat[:1]) @ self.metric
+        displacement = float(rms(np.linalg.norm(rows - rows[0], axis=-1)))
         beyond, why = bool(outside), outside
         if self.reach is not None and not beyond:
-            left = np.flatnonzero(self.reach.of_states(xhat[finite] @ self.metric))
+            left = np.flatnonzero(self.reach.of_states(rows[finite]))
             if beyond := bool(len(left)):
                 why = f"its shape left those of the training runs at t = {t[finite][left[0]]:.3g} s"
         if diverged >= 0:
@@ -296,8 +315,9 @@ class Trust:
         if self.reach is None or not self.validated.size:
             return 1.0
         at = np.array([values[name] for name in self.reach.names])
-        width = np.ptp(self.reach.box, axis=1)
-        sides = np.abs(self.validated - at)[:, width > 0.0] / width[width > 0.0]
+        low, high = self.reach.box.T
+        varies = high > low
+        sides = np.abs(self.validated - at)[:, varies] / (high - low)[varies]
         return 1.0 + _AWAY * float(sides.max(1, initial=0.0).min())
 
     def calibrated(

@@ -56,6 +56,33 @@ def on_torch_stream(device):
     return wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False, sync_exit=False)
 
 
+class ReadBack:
+    """Copies to the host that wait for the work on a device up to `mark`, and for none that follows it.
+
+    Without it a small copy waits for all that was queued before it, as the decoding of a whole run.
+
+    Args:
+        device: Warp device of the tensors.
+    """
+
+    def __init__(self, device):
+        self._event = torch.cuda.Event() if device.is_cuda else None
+        self._stream = torch.cuda.Stream(torch_device(device)) if device.is_cuda else None
+
+    def mark(self) -> None:
+        """Let copies wait for what torch's current stream has been given by now."""
+        if self._event is not None:
+            self._event.record(torch.cuda.current_stream(self._stream.device))
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        """The values on the host, as they were at `mark`; nothing may write over them until then."""
+        if self._event is None:
+            return values.cpu()
+        self._stream.wait_event(self._event)
+        with torch.cuda.stream(self._stream):
+            return values.cpu()
+
+
 @contextmanager
 def captured(device):
     """Capture what torch and Warp launch inside into one CUDA graph, which is yielded.

@@ -1,5 +1,6 @@
 """The latent vectors of a reduced run, and how well the inversion of each step went."""
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 
@@ -60,9 +61,11 @@ class LatentRecord:
         xhat: [steps + 1, r] latent vectors; zero where no step has been.
         residuals: [steps, k + 1] and updates: [steps, k], as in `ProjectionResult`.
         stress: [steps + 1, n_s] ŝ of a run that has them, which its engine makes; else None.
+        read_back: copies a tensor to the host; an engine that knows its last write gives a `ReadBack`.
     """
 
     stress: torch.Tensor | None = None
+    read_back: Callable[[torch.Tensor], torch.Tensor] = staticmethod(torch.Tensor.cpu)
 
     def __init__(self, xhat: torch.Tensor, steps: int, iterations: int):
         runs, r = xhat.shape[:-1], xhat.shape[-1]

@@ -257,11 +257,11 @@ class ReducedMPM:
     @property
     def latents(self) -> np.ndarray:
         """x̂ [N + 1, r] up to now, on the host."""
-        return self.record.xhat[: self.steps_taken + 1].cpu().numpy()
+        return self.record.read_back(self.record.xhat[: self.steps_taken + 1]).numpy()
 
     @property
     def members(self) -> np.ndarray | None:
-        """x̂ [M, N + 1, r] of each member of its model up to now, on the host; None of a single one."""
+        """x̂ [M, n + 1, r] of members of its model at each of the span's strides; None of a single one."""
         members = self.span.members(self.steps_taken)
         return None if members is None else members[:, self.index].double().numpy()
 

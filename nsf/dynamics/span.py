@@ -41,7 +41,7 @@ class Span(ABC):
 
     Attributes:
         batch, sets, at_sample: the arguments; record: the batch's.
-        s: |S|; size: particles of each run that a step may need.
+        s: |S|; size: particles of each run that a step may need; stride: steps that it takes as one.
         latent_only: whether it is a `LatentOnlySpan`.
         capturable: whether a step is the same launches each time; graph: of a step, where it is captured.
     """
@@ -50,6 +50,7 @@ class Span(ABC):
     capturable = True
     graph = None
     size = 0
+    stride = 1
 
     def __init__(self, batch: Batch, sets: ParticleSets, at_sample: Restriction):
         self.batch, self.record, self.sets = batch, batch.record, sets
@@ -73,7 +74,7 @@ class Span(ABC):
         return (changes / setup.dt).to(setup.torch_device, setup.dtype)
 
     def members(self, steps: int) -> torch.Tensor | None:
-        """x̂ [M, B, steps + 1, r], on the host, of each member of a model that has several; else None."""
+        """x̂ [M, B, n + 1, r] at each `stride` up to a step, on the host, of members; None of a single one."""
         return None
 
     @property

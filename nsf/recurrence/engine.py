@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
+from nsf.dynamics.interop import ReadBack
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import LatentOnlySpan, Span
 from nsf.engines.base import Engine
@@ -121,11 +122,13 @@ class Runs:
         self._first = torch.stack(
             [first_change(one.manifold, s.constants.X, s.initial_velocity, k * s.dt) for s in batch.setups]
         )
-        self._done = 0  # strides
+        self._steps, self._done = 0, 0  # taken, and strides
         gravity, features = self._acting()
         self.loop = Loop(form, self._parameters, gravity, features, one.precision, one.device)
         record = batch.record
         record.stress = record.xhat.new_zeros(len(batch), one.total_steps + 1, form.sizes.stress)
+        record.read_back = ReadBack(one.device)
+        self._write = self.loop.recorder(self._first, record)
 
     def _acting(self) -> tuple[Tensor, Tensor]:
         """Gravity [B, N, 3] [m/s²] and states of the colliders [B, N, f], as now known, in strides."""
@@ -139,13 +142,14 @@ class Runs:
     def enter(self) -> None:
         """Go on from the latent vectors of the record."""
         record, k = self._batch.record, self._form.stride
-        steps = int(record.row.max())
-        self._done = steps // k
+        self._steps = int(record.row.max())
+        self._done = self._steps // k
         path = record.xhat[:, : self._done * k + 1 : k].to(self._first)
         change = self._first if not self._done else path[:, -1] - path[:, -2]
         state = self._form.begin(path[:, -1], change)._replace(stress=self._stress_along(path))
         self.loop.xhat[:, :, : self._done + 1] = path.to(self.loop.xhat)
         self.loop.begin(state, self._done)
+        record.read_back.mark()
         self._force(self._done)
 
     def _stress_along(self, path: Tensor) -> Tensor:
@@ -168,45 +172,26 @@ class Runs:
 
     def take(self, steps: int) -> None:
         """Take steps of the full-order Δt."""
-        record, k = self._batch.record, self._form.stride
-        begin = int(record.row.max())
-        end, strides = begin + steps, -(-(begin + steps) // k)
+        record, begin = self._batch.record, self._steps
+        end, strides = begin + steps, -(-(begin + steps) // self._form.stride)
         self._force(self._done)
         if strides > self._done:
             self.loop.advance(self._done, strides - self._done)
             self._done = strides
-        since = begin // k  # node from which on frames are new
-        nodes = self.loop.xhat.mean(0)[:, max(0, since - 1) : strides + 1]
-        first = self._first.to(nodes) if since == 0 else nodes[:, 1] - nodes[:, 0]
-        rows = between(nodes[:, min(since, 1) :], first, k)
-        record.xhat[:, begin + 1 : end + 1] = rows[:, begin + 1 - since * k : end + 1 - since * k]
-        stress = _linear(self.loop.stress.mean(0)[:, since : strides + 1], k)
-        record.stress[:, begin + 1 : end + 1] = stress[:, begin + 1 - since * k : end + 1 - since * k]
-        record.before.copy_(record.xhat[:, end - 1])
-        record.now.copy_(record.xhat[:, end])
-        record.row.fill_(end)
+        self._write(begin, end)
+        record.read_back.mark()
+        self._steps = end
 
     def members(self, steps: int) -> Tensor | None:
-        """x̂ [M, B, steps + 1, r] of members, on the host, linear between strides; None of a single one."""
-        k = self._form.stride
+        """x̂ [M, B, n + 1, r] of members at strides, on the host; None of a single one."""
         if self._form.sizes.members == 1:
             return None
-        nodes = self.loop.xhat[:, :, : -(-steps // k) + 1].cpu()  # to launch the rest takes longer
-        return _linear(nodes, k)[:, :, : steps + 1]
+        return self._batch.record.read_back(self.loop.xhat[:, :, : -(-steps // self._form.stride) + 1])
 
     @property
     def nbytes(self) -> int:
         """Bytes beside the record."""
         return self.loop.nbytes
-
-
-def _linear(nodes: Tensor, stride: int) -> Tensor:
-    """Values [..., N k + 1, q] at all steps of those [..., N + 1, q] at strides, linear between them."""
-    if stride == 1:
-        return nodes
-    part = torch.arange(stride, device=nodes.device, dtype=nodes.dtype)[:, None] / stride
-    inside = torch.lerp(nodes[..., :-1, None, :], nodes[..., 1:, None, :], part)
-    return torch.cat([inside.flatten(-3, -2), nodes[..., -1:, :]], -2)
 
 
 class RecurrenceSpan(LatentOnlySpan):
@@ -221,7 +206,7 @@ class RecurrenceSpan(LatentOnlySpan):
 
     def __init__(self, batch: Batch, sets, at_sample, runs: Runs):
         super().__init__(batch, sets, at_sample)
-        self._runs = runs
+        self._runs, self.stride = runs, runs.loop.form.stride
 
     @override
     def enter(self, first: bool) -> None:

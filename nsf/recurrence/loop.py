@@ -1,11 +1,13 @@
 """The compiled loop: whole runs in one launch, a block of a GPU or a CPU's thread for each run and member."""
 
+from collections.abc import Callable
 from functools import cache
 
 import torch
 import warp as wp
 
 from nsf.dynamics.interop import torch_device, torch_dtype
+from nsf.dynamics.latent import LatentRecord
 from nsf.mpm import Precision
 from nsf.mpm.native import native_code
 from nsf.mpm.native.access import WARP
@@ -60,6 +62,65 @@ def make_recurrence(precision: Precision, sizes: Sizes):
     return recurrence
 
 
+@cache
+def make_frames(precision: Precision):
+    """Kernel of the record of runs: means over members at each step, of values at each stride.
+
+    x̂ is on the parabola of `between`, ŝ on the line from one stride to the next. It has a thread for each
+    value at the steps from `begin` to `end`; that at `begin` stays as it is.
+    """
+    real = precision.real
+
+    @wp.func
+    def mean(nodes: wp.array4d(dtype=real), run: int, node: int, i: int):
+        total = real(0.0)
+        for member in range(nodes.shape[0]):
+            total += nodes[member, run, node, i]
+        return total / real(nodes.shape[0])
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def frames(
+        xhats: wp.array4d(dtype=real),
+        stresses: wp.array4d(dtype=real),
+        first: wp.array2d(dtype=real),
+        stride: int,
+        xhat: wp.array3d(dtype=real),
+        stress: wp.array3d(dtype=real),
+        before: wp.array2d(dtype=real),
+        now: wp.array2d(dtype=real),
+        row: wp.array(dtype=wp.int64),
+        begin: int,
+        end: int,
+    ):
+        run, step, i = wp.tid()
+        n = begin + step
+        node, part = n / stride, real(n % stride) / real(stride)
+        k = i - first.shape[1]
+        if k >= 0:
+            if n > begin:
+                value = mean(stresses, run, node, k)
+                if n % stride:
+                    value += part * (mean(stresses, run, node + 1, k) - value)
+                stress[run, n, k] = value
+            return
+        if n > begin:
+            value = mean(xhats, run, node, i)
+            if n % stride:
+                change = first[run, i]
+                if node > 0:
+                    change = value - mean(xhats, run, node - 1, i)
+                next = mean(xhats, run, node + 1, i) - value
+                value += real(0.5) * part * ((change + next) + part * (next - change))
+            xhat[run, n, i] = value
+        if n == end - 1:
+            before[run, i] = xhat[run, n, i]
+        if n == end:
+            now[run, i] = xhat[run, n, i]
+            row[run] = wp.int64(end)
+
+    return frames
+
+
 def folded(form: Form, parameters: torch.Tensor) -> dict[str, torch.Tensor]:
     """Weights of the loop, all scales in them, and the biases [M B, width] of each run; in fp64.
 
@@ -86,12 +147,13 @@ class Loop:
         precision, device: of the loop.
 
     Attributes:
+        form: the argument.
         xhat: [M, B, N + 1, r] and stress: [M, B, N + 1, n_s] at each stride, as far as the runs have come.
     """
 
     def __init__(self, form: Form, parameters, gravity, features, precision: Precision, device):
         where, dtype, sizes = torch_device(device), torch_dtype(precision), form.sizes
-        self._form, self._sizes, self._count, self._device = form, sizes, len(parameters), device
+        self.form, self._sizes, self._count, self._device = form, sizes, len(parameters), device
         each, strides = sizes.members * len(parameters), gravity.shape[1]
         real = {"dtype": dtype, "device": where}
         with torch.no_grad():
@@ -111,8 +173,12 @@ class Loop:
             values = self._held.get(name, torch.zeros(0, **real))  # without ŝ it has no network
             rows = values.flatten() if variable.type.ndim == 1 else values
             setattr(self._given, name, wp.from_torch(rows))
-        self._kernel = make_recurrence(precision, sizes)
-        self._lanes = lanes_of(sizes) if device.is_cuda else 1
+        lanes = lanes_of(sizes) if device.is_cuda else 1
+        self._launch = wp.launch(
+            make_recurrence(precision, sizes), each * lanes, [self._given, 0, 0, len(parameters), lanes],
+            device=device, block_dim=lanes, record_cmd=True,
+        )  # fmt: skip
+        self._precision = precision
 
     @property
     def state(self) -> State:
@@ -132,7 +198,7 @@ class Loop:
     def force(self, since: int, gravity: torch.Tensor, features: torch.Tensor) -> None:
         """Replace gravity [B, N, 3] [m/s²] and states of the colliders [B, N, f] from a stride on."""
         with torch.no_grad():
-            values = {"gravity": gravity, "states": self._form.collider_state(features)}
+            values = {"gravity": gravity, "states": self.form.collider_state(features)}
         for name, rows in values.items():
             if rows.shape[-1]:
                 held = self._held[name].view(len(rows), -1, rows.shape[-1])
@@ -140,12 +206,34 @@ class Loop:
 
     def advance(self, first: int, strides: int) -> None:
         """Take strides of every run from a number of them on, in one launch."""
-        each = self._sizes.members * self._count
-        wp.launch(
-            self._kernel, dim=each * self._lanes,
-            inputs=[self._given, first, strides, self._count, self._lanes],
-            device=self._device, block_dim=self._lanes,
+        for index, value in ((1, first), (2, strides)):
+            self._launch.set_param_at_index(index, value)
+        self._launch.launch()
+
+    def recorder(self, first: torch.Tensor, record: LatentRecord) -> Callable[[int, int], None]:
+        """A call that writes a record after one step up to another, as far as the strides have come.
+
+        Args:
+            first: [B, r] the change before the first stride.
+            record: of the same runs; with `stress`.
+        """
+        r, n_s, shown = self._sizes.latents, self._sizes.stress, wp.from_torch
+        stresses, stress = (self.stress, record.stress) if n_s else (self.xhat, record.xhat)  # none is empty
+        into = record.xhat, stress, record.before, record.now
+        values = self.xhat, stresses, first.to(record.xhat).contiguous()
+        inputs = [*map(shown, values), self.form.stride, *map(shown, into), shown(record.row), 0, 0]
+        launch = wp.launch(
+            make_frames(self._precision), (self._count, 1, r + n_s), inputs, device=self._device,
+            record_cmd=True,
         )  # fmt: skip
+
+        def write(begin: int, end: int) -> None:
+            launch.set_dim((self._count, end - begin + 1, r + n_s))
+            for index, value in ((len(inputs) - 2, begin), (len(inputs) - 1, end)):
+                launch.set_param_at_index(index, value)
+            launch.launch()
+
+        return write
 
     @property
     def nbytes(self) -> int:

@@ -330,7 +330,7 @@ def test_members_tell_of_the_error(reduced, tiny_trust):
     run = rollouts(solver.together, [angle(26.0)], tiny_trust)[0]
     assert (run.by, set(run.stops)) == ("", {"latent"})
     members = solver.members
-    assert members.shape == (2, 25, 4)
+    assert members.shape == (2, 24 // solver.span.stride + 1, 4)
     x = solver.span.at_sample.position(torch.as_tensor(members[:, -1]))
     spread = float((x - x.mean(0)).square().sum((0, 2)).mean().sqrt())  # over one less than two members
     assert run.signal[0] < 1e-12

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from forms import form, inputs
 
+from nsf.dynamics.latent import LatentRecord
 from nsf.inverse.recurrence import differentiable_run
 from nsf.live.publish import recurrence_arrays, recurrence_header
 from nsf.mpm import precision_of
@@ -111,6 +112,26 @@ def test_gradients_are_those_of_differences(kind, monkeypatch):
         return
     shared = [*values[:3], *(v.detach()[:, :1].clone().requires_grad_() for v in values[3:])]
     assert torch.autograd.gradcheck(run, shared, **how)
+
+
+@kinds
+def test_a_record_is_the_mean_of_members_between_strides(kind):
+    made = form(*kind)
+    values = inputs(made, runs=2, strides=12)
+    loop, d, k = looped(made, *values), values[1], kind[4]
+    record = LatentRecord(values[0], 12 * k, 1)
+    record.stress = torch.zeros(2, 12 * k + 1, kind[0], dtype=torch.float64)
+    write = loop.recorder(d, record)
+    for begin, end in ((0, 1), (1, 5), (5, 12 * k)):
+        write(begin, end)
+    xhat, stress = between(loop.xhat.mean(0), d, k), loop.stress.mean(0)
+    torch.testing.assert_close(record.xhat, xhat)
+    torch.testing.assert_close((record.before, record.now), (xhat[:, -2], xhat[:, -1]))
+    assert record.row.tolist() == [12 * k] * 2
+    torch.testing.assert_close(record.stress[:, k::k], stress[:, 1:])
+    if k > 1:
+        line = torch.lerp(stress[:, :-1], stress[:, 1:], 1 / k)
+        torch.testing.assert_close(record.stress[:, 1::k], line)
 
 
 def test_a_linear_recurrence_has_the_gradient_of_its_powers():
