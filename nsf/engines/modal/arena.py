@@ -9,7 +9,7 @@ import warp as wp
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.mpm import Precision
 
-_ENTRIES = 2**23  # values of modes taken at once
+_ENTRIES = 2**19  # values of modes taken at once: what is held beside those of a solver is a few MiB
 
 
 class Arena:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from torch.profiler import ProfilerActivity, profile
 
 from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.closure import packed_weights, projection_block
@@ -226,3 +227,13 @@ def test_the_inversion_finds_the_latents_that_moved_the_sample(
     taken = (held["updates"].cpu() > 0).sum(1)
     assert held["row"].flatten().tolist() == [1] * runs
     assert (taken < iterations).all() if stops else (taken == iterations).all()
+
+
+def test_modes_are_taken_in_small_parts():
+    """A solver's peak is then what it holds, and not several copies of its modes beside."""
+    arena, table = Arena(precision_of("fp64"), warp_device("cpu")), torch.ones(6000, 9, 64)
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
+        held = arena.modes(table, None, torch.float16, torch.ones(64).double()).nbytes
+    events = recorded.profiler.kineto_results.events()
+    changes = sorted((e.start_ns(), e.nbytes()) for e in events if e.name() == "[memory]")
+    assert np.cumsum([size for _, size in changes]).max() < held + 2**24
