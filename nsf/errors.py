@@ -86,7 +86,7 @@ def unknown(key: str, keys: Iterable[str], taker: str = "") -> str:
     if not near and parent and beside:
         return f"{head}; {parent} has {', '.join(beside)}"
     near = near or difflib.get_close_matches(key, keys, n=1)
-    return f"{head}; {f'did you mean {near[0]}?' if near else 'see `nsf --help` for the groups'}"
+    return f"{head}; {f'did you mean {near[0]}?' if near else 'see `nsf run --help` for the groups'}"
 
 
 # How libraries say that memory ran out, or that a limit on it, as `ulimit -v`, was met.

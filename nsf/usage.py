@@ -1,4 +1,4 @@
-"""The text of `nsf --help`: stages, tools, examples, groups and keys."""
+"""The texts of `nsf --help` and of `nsf COMMAND --help`: commands, examples, groups and keys."""
 
 import re
 import textwrap
@@ -74,12 +74,38 @@ TOOLS = {
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
+#: Of `nsf --help`; `nsf COMMAND --help` has the details.
+_OVERVIEW = """\
+usage: nsf COMMAND [key=value …]      nsf COMMAND --help says more
+
+a project of yours:
+  nsf init FOLDER mesh=FILE unit=mm   around your mesh; FOLDER/README.md goes on
+  nsf plan scene=NAME                 what a run does, and how long it takes
+  nsf run scene=NAME                  simulate, train, deploy, evaluate, report
+
+parts of a run:
+  simulate train teach deploy evaluate report    one by one
+  superresolve  the deployed fields at many more points
+  point         a material along a deformation path
+  search        keys that make errors small
+
+a model in use:
+  demo          in the browser, at once, with nothing to train
+  view          steered in the browser
+  serve         as a stream that browsers decode
+  export        as a page, USD, VTK, ONNX or film
+  calibrate     parameters from observations
+  sample        thousands of runs: quantiles, sensitivities
+  design        forcing that brings a target about
+
+records:
+  runs          list, compare, verify, delete runs
+  index         a page of all runs
+  reports       a page of all reports
+  bench         time and memory of a step
+  doctor        versions, devices, folders"""
 _EXAMPLES = """\
 examples:
-  nsf init FOLDER mesh=FILE unit=mm
-      a project around your own mesh, law and forcing: begin here for your own
-  nsf demo
-      a model in the browser, at once
   nsf run scene=sand scale=small
       the paper's method in a minute or two, on a CPU
   nsf run scene=sand stress=deformation affine=none
@@ -88,8 +114,6 @@ examples:
       every combination
   nsf run -m +experiment=timestep hydra/launcher=joblib
       the jobs of an experiment side by side, and their report
-  nsf runs stage=evaluate scene=sand sort=displacement_error
-      runs by what made them, the best first
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS). Every command
 takes --config-dir DIR, or NSF_CONFIG=DIR: a folder with groups of yours, as
@@ -102,12 +126,8 @@ def primary(stage: str) -> str:
 
 
 def whole() -> str:
-    """Of `nsf --help`."""
-    width = max(map(len, STAGES))
-    stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
-    tools = "\n".join(f"  {name:<{width}}  {text}" for name, (text, _) in TOOLS.items())
-    usage = "usage: nsf STAGE [-m] [+experiment=NAME] [key=value …]"
-    return fitted(f"{usage}\n\nstages:\n{stages}\n\ntools:\n{tools}\n\n{_EXAMPLES}\n\n{groups_text()}")
+    """Of `nsf --help`: every command, the three of a new project first."""
+    return _OVERVIEW
 
 
 def of_tool(name: str) -> str:
@@ -161,7 +181,9 @@ def of_stage(stage: str) -> str:
     name = primary(stage)
     experiment = "" if stage == "point" else " [+experiment=NAME]"
     keys = (CONF / f"{name}.yaml").read_text(encoding="utf-8")
+    parts = [STAGES[stage], *([_EXAMPLES] if stage == "run" else []), groups_text()]
+    middle = "\n\n".join(parts)
     return fitted(
-        f"usage: nsf {stage} [-m]{experiment} [key=value …]\n\n{STAGES[stage]}\n\n{groups_text()}\n\n"
+        f"usage: nsf {stage} [-m]{experiment} [key=value …]\n\n{middle}\n\n"
         f"keys and defaults (conf/{name}.yaml):\n{keys}"
     )

@@ -109,7 +109,7 @@ def test_wheel_runs_from_an_empty_folder(wheel, tiny, tmp_path):
     where = run(fresh / "bin" / "python", "-c", "from nsf.paths import *; print(CONF, EXPERIMENTS)")
     assert where.stdout.split() == [f"{site}/nsf/conf", f"{site}/nsf/experiments"], where.stderr
 
-    shown = run(fresh / "bin" / "nsf", "--help")
+    shown = run(fresh / "bin" / "nsf", "run", "--help")
     assert "drucker_prager" in shown.stdout, shown.stderr
 
     done = run(fresh / "bin" / "nsf", "run", *tiny)

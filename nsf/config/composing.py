@@ -371,7 +371,7 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         pairs = (o.lstrip("+").split("=", 1) for o in overrides if "=" in o)
         options = [f"{group}={name}" for group, name in pairs if name not in groups().get(group, [name])]
         if options:
-            return f"{options[0]} names no option of its group; `nsf --help` lists them"
+            return f"{options[0]} names no option of its group; `nsf run --help` lists them"
     if first.startswith("Error merging override") and error.__cause__ is not None:
         return f"{first.removeprefix('Error merging override ')}: {str(error.__cause__).splitlines()[0]}"
     option = re.search(r"Could not find '([^']+)'", text)
