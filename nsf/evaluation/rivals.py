@@ -32,7 +32,9 @@ def forcing_of(scene: Scene) -> np.ndarray:
     """
     acting, parts = scene.forcing_at(scene.dt * np.arange(scene.steps)), []
     if scene.forcing.gravity:
-        parts.append(acting["gravity"].ravel() / (scene.forcing.reach(scene.base_gravity) or 1.0))
+        parts.append(
+            acting["gravity"].ravel() / (scene.forcing.reach(scene.base_gravity, scene.duration) or 1.0)
+        )
     moved = [name in scene.forcing.colliders for name in scene.colliders]
     parts.append(acting["solids"][:, moved, :3].ravel() / scene.dx)
     return np.concatenate(parts)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from nsf.scenes.inclination import Inclination
     from nsf.scenes.parameters import Parameter
     from nsf.scenes.programs import (
+        GravityCurve,
         GravityProgram,
         Keyframes,
         MotionProgram,
@@ -33,6 +34,7 @@ __all__ = [
     "Cylinder",
     "Design",
     "Frame",
+    "GravityCurve",
     "GravityProgram",
     "Grid",
     "Inclination",

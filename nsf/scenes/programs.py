@@ -5,19 +5,23 @@ their value of the moment alone, so a program may be of any length, and a hand m
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from zlib import crc32
 
 import numpy as np
 
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, first_line
 from nsf.mpm import Gravity, Motion
 from nsf.scalars import number
 from nsf.vectors import direction, numbers
 
 #: Keyframes between two knots of a program.
 _KEYFRAMES = 8
+#: Keyframes of a curve; curves of which its reach is the most, and how much further it is taken to go.
+_OF_CURVE, _TRIED, _SPARE = 101, 64, 1.02
+#: Draws numbers, as `numpy.random.Generator.uniform(low, high)` does.
+Draw = Callable[..., float]
 
 
 class GravityProgram(ABC):
@@ -34,8 +38,62 @@ class GravityProgram(ABC):
         """
 
     @abstractmethod
-    def reach(self, gravity: float) -> float:
-        """How far from a gravity of that size [m/s²] it may take it at most [m/s²]."""
+    def reach(self, gravity: np.ndarray, duration: float) -> float:
+        """How far from a gravity [3] [m/s²] it may take it at most [m/s²], in a run of that duration [s]."""
+
+
+@dataclass(frozen=True)
+class GravityCurve(GravityProgram):
+    """A program that is a formula of the time: keyframes, and how far they reach, are sampled from it."""
+
+    @abstractmethod
+    def values(self, t: np.ndarray, gravity: np.ndarray, draw: Draw) -> np.ndarray:
+        """The gravity that a run has.
+
+        Args:
+            t: [n] times [s], from 0 to the end of the run.
+            gravity: [n, 3] of the scene at these times [m/s²], or as an earlier program left it.
+            draw: `draw(low, high)` is a number between both that differs from run to run.
+
+        Returns:
+            [n, 3] along x, y and z [m/s²].
+        """
+
+    def of(self, gravity: Gravity, duration: float, generator: np.random.Generator) -> Gravity:
+        """See `GravityProgram.of`.
+
+        Raises:
+            ConfigError: `values` fails, or gives another shape or no numbers.
+        """
+        return self._drawn(gravity, duration, generator.uniform)
+
+    def reach(self, gravity: np.ndarray, duration: float) -> float:
+        """See `GravityProgram.reach`: the most of drawn curves, half of them of ends of ranges, and a bit."""
+        base, generator, far = Gravity.constant(gravity), np.random.default_rng(0), 0.0
+
+        def end(low=0.0, high=1.0, size=None):
+            return np.where(generator.random(size) < 0.5, low, high)[()]
+
+        for draw in (generator.uniform, end):
+            for _ in range(_TRIED):
+                values = np.asarray(self._drawn(base, duration, draw).values)
+                far = max(far, float(np.linalg.norm(values - gravity, axis=1).max()))
+        return _SPARE * far
+
+    def _drawn(self, gravity: Gravity, duration: float, draw: Draw) -> Gravity:
+        t = np.linspace(0.0, duration, _OF_CURVE)
+        name = f"{type(self).__name__}.values"
+        try:
+            values = self.values(t, np.array(gravity.at(t)), draw)
+        except Exception as error:
+            text = f"{name} raises {type(error).__name__}: {first_line(error)}"
+            raise ConfigError(f"{text}; give gravity at each time") from error
+        if np.shape(values) != (len(t), 3):
+            raise ConfigError(
+                f"{name} gives an array of shape {list(np.shape(values))}; return gravity at each of "
+                f"{len(t)} times along x, y and z, as np.stack([x, y, z], axis=1)"
+            )
+        return Gravity(t.tolist(), np.asarray(values, float).tolist())
 
 
 class MotionProgram(ABC):
@@ -87,9 +145,9 @@ class Keyframes(GravityProgram):
                 )
         return Gravity(self.times, self.values)
 
-    def reach(self, gravity: float) -> float:
+    def reach(self, gravity: np.ndarray, duration: float) -> float:
         """See `GravityProgram.reach`."""
-        return float(np.linalg.norm(self.values, axis=1).max()) + gravity
+        return float(np.linalg.norm(self.values, axis=1).max() + np.linalg.norm(gravity))
 
 
 @dataclass(frozen=True)
@@ -114,9 +172,9 @@ class RandomTilt(GravityProgram):
         tilt *= np.radians(self.angle)
         return Gravity(times.tolist(), tilted(gravity.at(times), tilt).tolist())
 
-    def reach(self, gravity: float) -> float:
+    def reach(self, gravity: np.ndarray, duration: float) -> float:
         """See `GravityProgram.reach`."""
-        return 2.0 * gravity * float(np.sin(0.5 * np.radians(self.angle)))
+        return 2.0 * float(np.linalg.norm(gravity) * np.sin(0.5 * np.radians(self.angle)))
 
 
 @dataclass(frozen=True)
@@ -143,7 +201,7 @@ class RandomShake(GravityProgram):
         values = gravity.at(times) + added @ across(gravity.at(0.0))
         return Gravity(times.tolist(), values.tolist())
 
-    def reach(self, gravity: float) -> float:
+    def reach(self, gravity: np.ndarray, duration: float) -> float:
         """See `GravityProgram.reach`."""
         return self.acceleration
 
@@ -268,11 +326,12 @@ class Programs:
         _check_made("colliders", collider, drive, motion, Motion)
         return motion
 
-    def reach(self, gravity: Sequence[float]) -> float:
-        """How far from the scene's gravity [3] any run's may be [m/s²]."""
-        size, far = float(np.linalg.norm(gravity)), 0.0
+    def reach(self, gravity: Sequence[float], duration: float) -> float:
+        """How far from the scene's gravity [3] that of any run of some duration [s] may be [m/s²]."""
+        base, far = np.asarray(gravity, float), 0.0
+        down = _unit(base) if base.any() else np.array([0.0, 0.0, -1.0])
         for change in self.gravity.values():
-            far += change.reach(size + far)
+            far += change.reach(base + far * down, duration)
         return far
 
     def check(self, names: Sequence[str], duration: float, dt: float, dx: float) -> None:

@@ -94,7 +94,7 @@ def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollou
     if scene.forcing.gravity:  # what programs may add, rather than what those of training did
         acting, reach = (
             np.array([[run.base_gravity] for run in runs]),
-            scene.forcing.reach(scene.base_gravity),
+            scene.forcing.reach(scene.base_gravity, scene.duration),
         )
     else:
         acting, reach = np.stack([run.acting_gravity.at(t) for run in runs]), 0.0

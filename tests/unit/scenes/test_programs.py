@@ -7,7 +7,7 @@ import nsf
 import nsf.scenes
 from nsf.errors import ConfigError
 from nsf.mpm import Gravity
-from nsf.scenes import Keyframes, Programs, RandomPress, RandomPush, RandomShake, RandomTilt
+from nsf.scenes import GravityCurve, Keyframes, Programs, RandomPress, RandomPush, RandomShake, RandomTilt
 
 DOWN = (0.0, 0.0, -9.81)
 T = np.linspace(0.0, 1.2, 400)
@@ -29,7 +29,7 @@ def test_a_tilt_starts_upright_keeps_its_size_and_stays_in_reach(seed, base):
     assert 3.0 < angle.max() < 35.0 + 1e-6
     # Between keyframes it is a chord of the sphere: shorter by a few thousandths.
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), size, rtol=5e-3)
-    assert np.linalg.norm(found - base, axis=1).max() <= program.reach(size) * (1 + 1e-9)
+    assert np.linalg.norm(found - base, axis=1).max() <= program.reach(np.array(base), 1.2) * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -77,9 +77,42 @@ class Numbers(RandomTilt):
         return gravity.at([0.0])
 
 
+class Swing(GravityCurve):
+    """Turns gravity about y, by an angle and a number of cycles that are drawn."""
+
+    def values(self, t, gravity, draw):
+        angle = np.radians(draw(5.0, 20.0)) * np.sin(2.0 * np.pi * draw(1.0, 3.0) * t / t[-1])
+        gravity[:, 0], gravity[:, 2] = -gravity[:, 2] * np.sin(angle), gravity[:, 2] * np.cos(angle)
+        return gravity
+
+
+def test_a_curve_reaches_as_far_as_it_is_drawn_to():
+    reach, turned = Swing().reach(np.array(DOWN), 1.2), 2.0 * 9.81 * np.sin(np.radians(10.0))
+    assert turned <= reach <= 1.03 * turned
+    drawn = [gravity_of(Swing(), seed) - DOWN for seed in range(200)]
+    assert 0.95 * turned < np.linalg.norm(drawn, axis=2).max() <= reach
+    assert Programs({"shake": RandomShake(2.0), "swing": Swing()}).reach(DOWN, 1.2) > reach + 2.0
+
+
+class Scalar(GravityCurve):
+    """Gives no vectors."""
+
+    def values(self, t, gravity, draw):
+        return t
+
+
+class Failing(GravityCurve):
+    """Reads a name that is not there."""
+
+    def values(self, t, gravity, draw):
+        return draw.low
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: gravity_of(Scalar(), 0), "along x, y and z"),
+        (lambda: gravity_of(Failing(), 0), "Failing.values raises AttributeError"),
         (lambda: Programs({"own": Numbers(35.0)}).gravity_of(DOWN, 1.0, 0), "return a nsf.mpm.Gravity"),
         (lambda: RandomTilt(0.0), "angle=0° must lie between 0° and 180°"),
         (lambda: RandomTilt(35.0, knots=0), "knots=0 must be a whole number"),
