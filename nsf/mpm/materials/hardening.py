@@ -1,7 +1,9 @@
 """Von Mises plasticity whose flow stress is a function of the plastic strain."""
 
 import ast
+import hashlib
 import inspect
+import linecache
 import math
 import textwrap
 from abc import abstractmethod
@@ -29,7 +31,7 @@ def _functions(law: type, precision: Precision) -> LawFunctions:
     real = precision.real
     constants = {"__annotations__": {field.name: real for field in fields(law)}, "__module__": law.__module__}
     Params = wp.struct(type(f"{law.__name__}Params", (), constants))
-    flow_stress = wp.func(_annotated(law.flow_stress, Params, real))
+    flow_stress = wp.func(_typed(law.flow_stress, Params, real))
 
     @wp.func
     def bound(gamma: real, params: Params):
@@ -43,12 +45,22 @@ def _functions(law: type, precision: Precision) -> LawFunctions:
     return LawFunctions(hencky_tau(precision), None, Params, update)
 
 
-def _annotated(method, *types: type) -> FunctionType:
-    """A copy of a method, as a function of arguments of these types."""
-    copy = FunctionType(method.__code__, method.__globals__, method.__name__)
-    copy.__annotations__ = dict(zip(method.__code__.co_varnames, types, strict=False))
-    copy.__module__, copy.__qualname__ = method.__module__, method.__qualname__
-    return copy
+def _typed(method: FunctionType, *types: type) -> FunctionType:
+    """A method as a function of arguments of these types, its numbers of the type of the second one."""
+    tree = ast.fix_missing_locations(_Typed(method).visit(_tree(method)))
+    text, made = ast.unparse(tree), {}
+    # Warp reads the text of a function where `inspect` has it from.
+    file = f"<{method.__module__}.{method.__qualname__} {hashlib.sha256(text.encode()).hexdigest()[:12]}>"
+    linecache.cache[file] = len(text), None, text.splitlines(keepends=True), file
+    exec(compile(text, file, "exec"), method.__globals__, made)
+    typed = made[method.__name__]
+    typed.__annotations__ = dict(zip(method.__code__.co_varnames, types, strict=False))
+    typed.__module__, typed.__qualname__ = method.__module__, method.__qualname__
+    return typed
+
+
+def _tree(method: FunctionType) -> ast.Module:
+    return ast.parse(textwrap.dedent(inspect.getsource(method)))
 
 
 @cache
@@ -64,13 +76,12 @@ def _check_text(law: type) -> None:
             "write the whole formula from the fields of the law"
         )
     try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(method)))
+        tree = _tree(method)
     except (OSError, SyntaxError) as error:
         raise ConfigError(
             f"{name} has no readable text ({first_line(error)}); write the class in a file and import it"
         ) from error
     _check_fields(law, tree)
-    _check_numbers(law, tree)
 
 
 def _check_fields(law: type, tree: ast.AST) -> None:
@@ -87,21 +98,22 @@ def _check_fields(law: type, tree: ast.AST) -> None:
                     )
 
 
-def _check_numbers(law: type, tree: ast.AST) -> None:
-    """Refuse numbers and constants of modules, which Warp would take for fp32 and int."""
-    calls = [
-        node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Call)
-    ]
-    typed = {part for call in calls for value in call.args for part in ast.walk(value)}
-    code = law.flow_stress.__code__
-    constants = {k: v for k, v in law.flow_stress.__globals__.items() if k not in code.co_varnames}
-    for node in ast.walk(tree):
-        if node not in typed and isinstance(_value(node, constants), int | float):
-            text, gamma = ast.unparse(node), code.co_varnames[1]
-            raise ConfigError(
-                f"{law.__name__}.flow_stress has the number {text}; write type({gamma})({text}), "
-                "which has the precision of a run"
-            )
+class _Typed(ast.NodeTransformer):
+    """Gives numbers and constants of modules the type of γ: Warp would take them for fp32 and int."""
+
+    def __init__(self, method: FunctionType):
+        names = method.__code__.co_varnames
+        self._gamma = names[1]
+        self._constants = {key: value for key, value in method.__globals__.items() if key not in names}
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        """The node, or its number as `type(gamma)(number)`."""
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Call):
+            return node  # has its type
+        value = _value(node, self._constants)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return ast.parse(f"type({self._gamma})({float(value)!r})", mode="eval").body
+        return self.generic_visit(node)
 
 
 def _value(node: ast.AST, constants: dict):
