@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from nsf import config as configuration
-from nsf.data.case import Case, with_unit
+from nsf.data.case import PROGRAM, Case, with_unit
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.durations import STAGES, START, Interval, crowding, due, interval, times, work_of
 from nsf.runs import Run
@@ -19,6 +19,7 @@ from nsf.storage import bytes_text
 
 #: Values of cases that a plan lists one by one; of more it has the ranges.
 _MOST_VALUES = 8
+_HEADINGS = ("stage", "state", "run", "time", "disk", "measured")
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Stage:
         count = len(self.runs) or 1  # a page is no run
         if not self.missing:
             return "there" if count == 1 else f"all {count} there"
-        return "to be made" if count == 1 else f"{self.missing} of {count} to be made"
+        return "to do" if count == 1 else f"{self.missing} of {count} to do"
 
 
 def plans(jobs: Sequence[Sequence[str]]) -> list[Pipeline]:
@@ -69,24 +70,31 @@ def stages_table(pipelines: Sequence[Pipeline]) -> Table:
     if len(pipelines) > 1:
         table.caption = f"{len(pipelines)} jobs, one after the other; runs that they share are made once"
         table.caption_justify = "left"
-    for heading, side in (
-        ("stage", "left"), ("state", "left"), ("run", "left"), ("time", "right"), ("disk", "right"),
-        ("measured", "left"),
-    ):  # fmt: skip
-        table.add_column(heading, justify=side, no_wrap=heading == "run")
     stages = stages_of(pipelines)
-    for stage in stages:
-        only = stage.runs[0].hash if len(stage.runs) == 1 else ""
-        cost = ["", "", ""]
-        if stage.missing:
-            size = bytes_text(stage.size) if stage.size else ""
-            cost = [_span(stage.time), size, stage.time.like or "nothing like it: a guess"]
-        table.add_row(stage.name, stage.state, only, *map(escape, cost))
-    if due := [stage for stage in stages if stage.missing]:
+    due = [stage for stage in stages if stage.missing]
+    guessed = not any(stage.time.like for stage in due)
+    rows = [_row(stage, guessed) for stage in stages]
+    if due:
         low, high = (sum(getattr(stage.time, end) for stage in due) for end in ("low", "high"))
         span = Interval(low + START / 2, high + 2 * START * crowding())
-        table.add_row("in all", "", "", _span(span), bytes_text(sum(stage.size for stage in due)), "")
+        size = bytes_text(sum(stage.size for stage in due))
+        rows.append(["in all", "", "", _span(span), size, "a guess" if guessed else ""])
+    columns = [column for column in zip(_HEADINGS, *rows, strict=True) if any(column[1:])]
+    for heading, *_ in columns:
+        side = "right" if heading in ("time", "disk") else "left"
+        table.add_column(heading, justify=side, no_wrap=heading == "run")
+    for cells in zip(*(column[1:] for column in columns), strict=True):
+        table.add_row(*map(escape, cells))
     return table
+
+
+def _row(stage: Stage, guessed: bool) -> list[str]:
+    """Name, state, hash, time, room of a stage, and what its time rests on unless all are guesses."""
+    if not stage.missing:
+        return [stage.name, stage.state, stage.runs[0].hash if len(stage.runs) == 1 else "", "", "", ""]
+    size = bytes_text(stage.size) if stage.size else ""
+    like = "" if guessed else stage.time.like or "a guess"
+    return [stage.name, stage.state, "", _span(stage.time), size, like]
 
 
 def stages_of(pipelines: Sequence[Pipeline]) -> list[Stage]:
@@ -140,10 +148,14 @@ def scene_table(pipeline: Pipeline) -> Table:
         "steps": f"{scene.steps:,} of Δt = {scene.dt:.4g} s; up to {stable:.3g} s is stable",
     }
     for name, thickness in thinnest(at).items():
-        cells = thickness / scene.dx
-        rows[f"thinnest of {name}"] = "2 cells or more" if math.isinf(cells) else f"{cells:.2g} cells"
-    for part in ("train", "validation", "test"):
-        rows[part] = _values_of(getattr(pipeline.split, part))
+        if math.isfinite(cells := thickness / scene.dx):
+            rows[f"thinnest of {name}"] = f"{cells:.2g} cells"
+    parts = {part: getattr(pipeline.split, part) for part in ("train", "validation", "test")}
+    if len(case) == 1:
+        rows |= {part: _values_of(cases) for part, cases in parts.items()}
+    else:
+        counts = ", ".join(f"{len(cases)} {part}" for part, cases in parts.items())
+        rows["cases"] = f"{counts}; {_ranges_of(pipeline.split.cases)}"
     rows["memory"] = _memory(pipeline)
     c = pipeline.config
     rows["deployed"] = f"on {pipeline.device}, model {pipeline.configured.name}, r {c.latent_dim}"
@@ -157,13 +169,22 @@ def scene_table(pipeline: Pipeline) -> Table:
 
 
 def _values_of(cases: Sequence[Case]) -> str:
-    """How many cases, and their values; the range of each parameter where these are many."""
-    if sum(map(len, cases)) <= _MOST_VALUES:
+    """How many cases of one parameter, and their values; its range where these are many."""
+    if len(cases) <= _MOST_VALUES:
         return f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
+    return f"{len(cases)}: {_ranges_of(cases)}"
+
+
+def _ranges_of(cases: Sequence[Case]) -> str:
+    """The range of each parameter of some cases, but for the numbers of programs."""
     columns = zip(*(case.numbers for case in cases), strict=True)
     ranges = zip_longest(cases[0].names, columns, cases[0].units, fillvalue="")
-    texts = [f"{name} {min(v):.4g} to {with_unit(f'{max(v):.4g}', unit)}" for name, v, unit in ranges]
-    return f"{len(cases)}: {', '.join(texts)}"
+    texts = [
+        f"{name} {min(v):.4g} to {with_unit(f'{max(v):.4g}', unit)}"
+        for name, v, unit in ranges
+        if name != PROGRAM
+    ]
+    return ", ".join(texts)
 
 
 def scenes(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
@@ -194,7 +215,7 @@ def _memory(pipeline: Pipeline) -> str:
     how = precision_of(pipeline.config.precision)
     solver = bytes_on_device(scene.particle_count, scene.grid, scene.material, how)
     frames = len(pipeline.split.train) * pipeline.stored_frames
-    kept = "" if resident is True else ", from disk" if not resident else ", from disk where they do not fit"
+    kept = "" if resident else ", from disk"
     data = bytes_text(resident_bytes(frames, scene.particle_count))
     return f"{bytes_text(solver)} of a full-order run; {data} of {frames:,} training frames{kept}"
 
