@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nsf.data import Case, TrajectoryWriter
+from nsf.data.motion import motion_warnings
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
@@ -248,8 +249,9 @@ def _store(
                 for frame in item:
                     writer.append(n * dt, **frame)
                     n += shared.every
+                last = np.array(frame["x"], float)  # of a block whose memory is taken again
                 item.done()
             writer.cost.update(item.cost._asdict())
-        record.warn(item.warnings)
+        record.warn([*item.warnings, *motion_warnings(constants.X, last, shared.dx)])
         record.metrics["seconds"] = item.cost.seconds
         record.output(TRAJECTORY)

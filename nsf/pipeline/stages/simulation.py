@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from nsf.data import Case
+from nsf.data.motion import FLAT, RIGID, STILL
 from nsf.pipeline.checks import check_room
 from nsf.pipeline.cores import helper_count
 from nsf.pipeline.trajectories import Job, Shared, simulate
@@ -36,6 +37,9 @@ def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str]
     made = make(pipeline, runs, warnings)
     elsewhere = f", {len(runs) - made} by another process" if made < len(runs) else ""
     pipeline.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
+    odd = [line for run in runs for line in run.manifest.get("warnings", ()) if line in (STILL, RIGID, FLAT)]
+    for line in dict.fromkeys(odd):
+        pipeline.say(f"simulate: warning: in {odd.count(line)} of {len(runs)} runs {line}")
     return made
 
 
