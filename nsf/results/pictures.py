@@ -7,6 +7,7 @@ full-order run, the model and the baseline.
 import math
 import re
 import shutil
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from nsf.results.charts import best
 from nsf.results.columns import BASELINE, model_name, number
 from nsf.results.page import Picture, Section
 from nsf.results.sources import Motion, Source
-from nsf.results.style import save
+from nsf.results.style import legend, line_style, panels, save, styled
 from nsf.results.table import natural
 from nsf.vectors import spaced
 
@@ -138,10 +139,14 @@ def _of_variant(
     caption = f"Bodies over time, {over}: full order, {ends[0].model}"
     caption += f", {BASELINE}" if ends[0].baseline is not None else ""
     caption += f". Colour: {_STRESS}. Displacement error of {ends[0].model}: {_errors(ends)}."
-    pictures = [Picture(save(strip(ends), folder, f"{stem}strip", ("png",), [STRESS_COLORS]), caption, runs)]
+    drawn = save(strip(ends), folder, f"{stem}strip", ("png",), [STRESS_COLORS])
+    pictures = [Picture(drawn, caption, runs, leads=True)]
     if not whole:
         return pictures
     every = sorted(cases(of_model, of_baseline, sources, _ROWS), key=lambda case: natural(case.motion.case))
+    if changing := [case.motion for case in every if changes(case.motion)]:
+        drawn = save(gravity(changing), folder, f"{stem}gravity")
+        pictures.append(Picture(drawn, "Gravity in the course of each held-out run.", runs, leads=True))
     ramps = [STRESS_COLORS, DIFFERENCE_COLORS]
     final = save(final_shapes(every), folder, f"{stem}final-shapes", ("png",), ramps)
     caption = "The last frame of each case, and how far each particle lies from the full-order run's. "
@@ -331,6 +336,26 @@ def animation(cases: Sequence[Shown], path: Path, max_bytes: int = GIF_BYTES) ->
     rows = [[body for _, body in row] for row in models]
     images = bodies.frames(rows, cases[0].motion.t, titles, _FRAMES, 2 * _WIDTH, cut=True)
     bodies.film(images, path, most=max_bytes)
+
+
+def changes(motion: Motion) -> bool:
+    """Whether gravity changes in the course of a run."""
+    acting = motion.surroundings.get("gravity", np.zeros((1, 3)))
+    return bool(np.ptp(acting, axis=0).max() > 1e-6 * np.abs(acting).max())
+
+
+def gravity(motions: Sequence[Motion]) -> Figure:
+    """Gravity over time along each axis, a panel a run."""
+    with styled():
+        fig, drawn = panels(len(motions), 2.4, 3, sharey=True)
+        for panel, motion in zip(drawn, motions, strict=True):
+            for k, name in enumerate("xyz"):
+                panel.plot(motion.t, motion.surroundings["gravity"][:, k], label=name, **line_style(k))
+            panel.set(title="\n".join(textwrap.wrap(motion.case, 40)), xlabel="time t [s]")
+            panel.grid()
+        drawn[0].set_ylabel("gravity [m/s²]")
+        legend(fig)
+    return fig
 
 
 def hides_stress(motion: Motion) -> bool:

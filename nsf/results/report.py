@@ -34,6 +34,7 @@ from nsf.results.page import Page, Picture, Section, Table
 from nsf.results.question import Question, made_of
 from nsf.results.sources import KEPT, Source, open_sources
 from nsf.results.style import save
+from nsf.results.verdict import verdict
 from nsf.runs import Run
 from nsf.runs.columns import differing
 from nsf.runs.listing import Entry
@@ -265,6 +266,7 @@ def write_pages(
         sections=[section for section in sections if section.pictures],
         provenance=Table("Where the numbers come from", provenance_rows(runs), _NOTE),
         definitions=definitions(used),
+        answers=verdict(view.frame),
     )
     page.write(folder)
     tex = latex_table(shown, question.title, first.note)

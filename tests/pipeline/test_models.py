@@ -174,7 +174,7 @@ def test_models_that_learn_share_encoded_runs(copied, pipeline_at):
         name = pipeline.model.name
         assert rows["model"].tolist() == [name]
         assert rows["displacement_error"][0] < 0.3
-        assert any(line.startswith(f"teach: model={name}, 11 full-order runs, 8 streamed") for line in said)
+        assert any(line.startswith(f"teach: model={name}, 11 full-order runs, 8 drawn") for line in said)
         metrics = pipeline.taught.manifest["metrics"]
         assert metrics["teach_seconds"] == metrics["stream_seconds"] + metrics["fit_seconds"]
         runs.append(pipeline.encoding)

@@ -57,7 +57,7 @@ def _say(pipeline, metrics: dict, run: Run) -> None:
     held_back = "validation" if pipeline.split.validation else "the training cases, as no others are there"
     pipeline.say(
         f"teach: model={pipeline.model.name}, {metrics['runs']} full-order runs, {metrics['streamed']} "
-        f"streamed in {metrics['stream_seconds']:.1f} s, fitted in {metrics['fit_seconds']:.1f} s, "
+        f"drawn in {metrics['stream_seconds']:.1f} s, fitted in {metrics['fit_seconds']:.1f} s, "
         f"{100 * min(metrics['errors']):.2g} % off at {held_back} → {run.id}"
     )
 

@@ -10,10 +10,12 @@ from made import Made, rewrite, seal, write_run
 
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.results import pictures, table
-from nsf.results.averages import interval
+from nsf.results.averages import interval, means
+from nsf.results.columns import number
 from nsf.results.question import Question, unchanged
 from nsf.results.report import build_report
 from nsf.results.sources import open_sources
+from nsf.results.verdict import verdict
 
 ASKED = Question(
     "trial", "Sand & <friends>", "How far?", "Table 1: 0.4 %.", missing=["seed=2: not run"], plots=["delta"]
@@ -56,6 +58,24 @@ def test_the_page_has_question_results_cases_and_origin(report):
     assert places == sorted(places)
     assert "&lt;friends&gt;" in (report / "index.html").read_text()
     assert "\\begin{tabular}" in (report / "results.tex").read_text()
+
+
+def test_a_page_of_one_model_begins_with_its_answers(report, runs, tmp_path, text_alone):
+    build_report(runs[:1], tmp_path / "one", Question("one", "T"))
+    page = (tmp_path / "one/index.html").read_text()
+    frame = table.labelled(table.read(tmp_path / "one/results.csv"))
+    (mean,) = means(frame)["displacement_error"]
+    answers = dict(verdict(frame))
+    assert answers["error"].startswith(f"{number(mean, 100)} % of the displacement")
+    assert page.index(answers["error"]) < page.index("<details>") < page.index("Each case")
+    assert not verdict(table.labelled(table.read(report / "results.csv")))
+
+
+def test_a_bound_says_in_how_many_runs_it_holds(runs):
+    frame = table.labelled(open_sources(runs[:1])[0].rows.assign(setting=""))
+    errors = frame["displacement_error"]
+    bounded = frame.assign(error_bound=[errors.iloc[0] * 1.1, errors.iloc[1] * 0.9], flag="green")
+    assert dict(verdict(bounded))["error bound"].endswith("held by 1 of 2 runs; 2 green")
 
 
 def test_the_table_names_the_run_of_each_row(report, runs):

@@ -1,0 +1,76 @@
+"""The short answer of a report of one model: its error, its bound, its rivals and its speed."""
+
+import math
+from pathlib import Path
+
+import pandas as pd
+from rich.console import RenderableType
+from rich.table import Table
+
+from nsf.results import table
+from nsf.results.averages import means
+from nsf.results.columns import COLUMNS, RIVALS, number
+from nsf.results.formats import terminal
+
+
+def verdict(frame: pd.DataFrame) -> list[tuple[str, str]]:
+    """What is answered, and the answer; nothing where a table compares several models, or scenes.
+
+    Args:
+        frame: as `nsf.results.table.labelled` gives it.
+    """
+    averages = means(frame)
+    if len(averages) != 1:
+        return []
+    row = averages.iloc[0]
+    answers = {
+        "error": _error(row, frame),
+        "error bound": _bound(frame),
+        "rivals": _rivals(row),
+        "speed": _speed(row),
+    }
+    return [(name, answer) for name, answer in answers.items() if answer]
+
+
+def on_terminal(path: Path) -> RenderableType:
+    """The answers of a report's `results.csv`, or its table where it has several rows."""
+    answers = verdict(table.labelled(table.read(path)))
+    if not answers:
+        return table.console_table(path)
+    grid = Table(box=None, show_header=False, pad_edge=False)
+    for row in answers:
+        grid.add_row(*map(terminal, row))
+    return grid
+
+
+def _error(row: pd.Series, frame: pd.DataFrame) -> str:
+    if row["diverged"]:
+        return f"{row['diverged']} of {row['cases']} runs diverged"
+    mean, worst = (number(row[name], 100) for name in ("displacement_error", "displacement_worst"))
+    cases = f"{row['cases']} {' and '.join(frame['split'].unique())} runs"
+    return f"{mean} % of the displacement, the mean of {cases}; largest {worst} %"
+
+
+def _bound(frame: pd.DataFrame) -> str:
+    bounds = frame["error_bound"]
+    if bounds.isna().any():
+        return ""
+    ends = " to ".join(dict.fromkeys(number(end, 100) for end in (bounds.min(), bounds.max())))
+    held = int((frame["displacement_error"] <= bounds).sum())
+    flags = ", ".join(f"{count} {flag}" for flag, count in frame["flag"].value_counts().items() if flag)
+    return f"{ends} %, held by {held} of {len(frame)} runs{flags and f'; {flags}'}"
+
+
+def _rivals(row: pd.Series) -> str:
+    errors = [(name, row[name]) for name in RIVALS if not math.isnan(row[name])]
+    listed = ", ".join(f"{COLUMNS[name].title} {number(error, 100)} %" for name, error in errors)
+    nearer = [COLUMNS[name].title for name, error in errors if error < row["displacement_error"]]
+    return f"{listed}; nearer than the model: {' and '.join(nearer) or 'none'}" if listed else ""
+
+
+def _speed(row: pd.Series) -> str:
+    if math.isnan(row["speedup_total"]):
+        return ""
+    decoded = f"; {number(row['speedup_decoded'])} with every frame decoded"
+    times = f"{number(row['speedup_total'])} times as fast as full order"
+    return times + (decoded if row["speedup_decoded"] > 0 else "")
