@@ -213,10 +213,8 @@ def _init(arguments: list[str]) -> int:
     from nsf.scenes import Mesh
 
     mesh = Mesh(options["mesh"], unit=options.get("unit", ""), up=options.get("up", "z")) if options else None
-    name = write_project(folder, mesh)
-    chain = f"--config-dir conf scene={name}"
-    commands = f"cd {folder}", "pip install -e .", f"nsf plan {chain}", f"nsf run {chain}"
-    print(f"wrote {folder}; next:", *commands, f"{folder / 'README.md'} says what to change", sep="\n  ")
+    write_project(folder, mesh)
+    print(f"wrote {folder}; go on with {folder / 'README.md'}")
     return 0
 
 
@@ -347,15 +345,15 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
 
 
 def _show(page, table: bool = True) -> None:
-    """The result table of a report, on the terminal, and where its page is."""
+    """The answers of a report, or its table, on the terminal; how long it took, and where its page is."""
     if table:
-        from nsf.results.averages import console_table
+        from nsf.results.verdict import on_terminal
 
-        screen().print(console_table(page.parent / "results.csv"))
+        screen().print(on_terminal(page.parent / "results.csv"))
     from nsf.progress import slowest_stage
 
-    print(f"open {page.resolve()}")
     print(slowest_stage())
+    print(f"open {page.resolve()}")
 
 
 if __name__ == "__main__":

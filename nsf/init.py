@@ -28,22 +28,21 @@ _MOST_CELLS = 24.0
 #: keep the motion. By bending alone E goes by k² and τ_Y by k; half of that, as a body is also sheared and
 #: crushed: an L 2.5 times as slender then deforms by 17 % of its length, the template's by 24 %.
 _EXPONENTS = {
-    "E": (1.0, 1.0), "yield_stress": (1.0, 0.5), "saturation": (1.0, 0.5), "size": (1.0, 0.0),
+    "E": (1.0, 1.0), "yield_stress": (1.0, 0.5), "size": (1.0, 0.0),
     "base": (1.0, 0.0), "point": (1.0, 0.0), "dx": (1.0, -1.0), "dt": (0.5, -1.5), "steps": (0.0, 1.5),
-    "velocity": (0.5, 0.0), "frequency": (-0.5, 0.0),
+    "velocity": (0.5, 0.0),
 }  # fmt: skip
 
 
-def write_project(folder: Path, mesh: Mesh | None = None) -> str:
+def write_project(folder: Path, mesh: Mesh | None = None) -> None:
     """Write a project into a folder that is not there yet, or is empty.
+
+    Its module and scene have the folder's name, with `_` for what such a name cannot have.
 
     Args:
         folder: of the project.
         mesh: of the body, with its unit; the template's by default. The file is copied, and the scene scaled
             to it.
-
-    Returns:
-        The name of its package and scene, which is the folder's with `_` for what a name cannot have.
 
     Raises:
         ConfigError: the folder has files, or no package can have its name, or an installed one has.
@@ -80,7 +79,6 @@ def write_project(folder: Path, mesh: Mesh | None = None) -> str:
             whole.rename(folder)
     except OSError as error:
         raise StorageError(f"{folder} cannot be written: {error.strerror}; name another folder") from error
-    return name
 
 
 def _renamed(text: str, names: Mapping[str, str]) -> str:

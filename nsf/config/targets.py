@@ -206,7 +206,9 @@ def _kind(path: tuple[str, ...], target: Any) -> Kind:
     if not (
         _NAME.fullmatch(str(target)) and (target.startswith(f"{kind.package}.") or _is_installed(target))
     ):
-        here = Path(str(target).partition(".")[0]).is_dir() and Path("pyproject.toml").is_file()
+        module = Path(str(target).partition(".")[0])
+        there = module.is_dir() or module.with_suffix(".py").is_file()
+        here = there and Path("pyproject.toml").is_file()
         install = "; pip install -e . installs that of this folder" if here else ""
         raise ConfigError(f"{refused}name a {_noun(kind)} {_homes(kind)}{install}")
     return kind

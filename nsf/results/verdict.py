@@ -8,7 +8,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from nsf.results import table
-from nsf.results.averages import means
+from nsf.results.averages import console_table, means
 from nsf.results.columns import COLUMNS, RIVALS, number
 from nsf.results.formats import terminal
 
@@ -36,7 +36,7 @@ def on_terminal(path: Path) -> RenderableType:
     """The answers of a report's `results.csv`, or its table where it has several rows."""
     answers = verdict(table.labelled(table.read(path)))
     if not answers:
-        return table.console_table(path)
+        return console_table(path)
     grid = Table(box=None, show_header=False, pad_edge=False)
     for row in answers:
         grid.add_row(*map(terminal, row))
