@@ -12,6 +12,9 @@ from nsf.results.averages import console_table, means
 from nsf.results.columns import COLUMNS, RIVALS, number
 from nsf.results.formats import terminal
 
+#: Of a body that never moves the error is 100 %.
+_RIVALS = [name for name in RIVALS if name != "displacement_static"]
+
 
 def verdict(frame: pd.DataFrame) -> list[tuple[str, str]]:
     """What is answered, and the answer; nothing where a table compares several models, or scenes.
@@ -62,10 +65,10 @@ def _bound(frame: pd.DataFrame) -> str:
 
 
 def _rivals(row: pd.Series) -> str:
-    errors = [(name, row[name]) for name in RIVALS if not math.isnan(row[name])]
-    listed = ", ".join(f"{COLUMNS[name].title} {number(error, 100)} %" for name, error in errors)
-    nearer = [COLUMNS[name].title for name, error in errors if error < row["displacement_error"]]
-    return f"{listed}; nearer than the model: {' and '.join(nearer) or 'none'}" if listed else ""
+    errors = {COLUMNS[name].title: row[name] for name in _RIVALS if not math.isnan(row[name])}
+    listed = ", ".join(f"{name} {number(error, 100)} %" for name, error in errors.items())
+    nearer = [name for name, error in errors.items() if error < row["displacement_error"]]
+    return f"{listed}; nearer: {' and '.join(nearer) or 'none'}" if listed else ""
 
 
 def _speed(row: pd.Series) -> str:

@@ -13,6 +13,7 @@ from nsf.data.schema import TRAJECTORY
 from nsf.deployment import (
     FLAGS,
     FULL_ORDER,
+    GREEN,
     PROJECTED,
     RED,
     TRUST,
@@ -72,12 +73,12 @@ def deploy_held_out(pipeline, run: Run) -> None:
         for index, rollout in enumerate(rollouts):
             rollout.save(record.path / rollout_file(index))
             record.output(rollout_file(index))
-            for line in _told(rollout):
-                pipeline.say(f"deploy: {line}")
             if rollout.by == FULL_ORDER:
                 truth = pipeline.truth(rollout.case).file(TRAJECTORY)
                 shutil.copyfile(truth, record.path / continuation_file(index))
                 record.output(continuation_file(index))
+        for line in _lines(rollouts):
+            pipeline.say(f"deploy: {line}")
         write_configuration(pipeline, record)
         flags, bound = zip(*((r.verdict.flag, r.verdict.bound_share) for r in rollouts), strict=True)
         record.metrics["seconds"] = [r.seconds for r in rollouts]
@@ -180,11 +181,28 @@ def _full_order(pipeline, manifold: Manifold, cases: Sequence[Case], limit: floa
     return rollouts
 
 
-def _told(rollout: Rollout) -> list[str]:
-    """Lines for the user: whether a run is to be believed, and what went wrong."""
+def _lines(rollouts: Sequence[Rollout]) -> list[str]:
+    """Lines for the user: whether runs are to be believed, green ones in one line, and what went wrong."""
+    greens = [one.verdict for one in rollouts if one.verdict.flag == GREEN and not one.by]
+    together = len(greens) > 1
+    lines = [
+        line
+        for one in rollouts
+        for line in _of_run(one, light=not together or one.verdict.flag != GREEN or bool(one.by))
+    ]
+    if not together:
+        return lines
+    expected = [verdict.error_share for verdict in greens]
+    most = percent(max(verdict.bound_share for verdict in greens))
+    errors = f"expected error {percent(min(expected))} to {percent(max(expected))}, at most {most}"
+    return [f"{len(greens)} runs are green: {errors}", *lines]
+
+
+def _of_run(rollout: Rollout, light: bool) -> list[str]:
     named = rollout.case.named
     by = f" by {rollout.by}" if rollout.by else ""
-    lines = [f"{named}{by}: {rollout.verdict.text}"] if rollout.verdict.reason != CALIBRATES else []
+    light = light and rollout.verdict.reason != CALIBRATES
+    lines = [f"{named}{by}: {rollout.verdict.text}"] if light else []
     if rollout.diverged >= 0:
         lines.append(
             f"warning: {named} diverged at step {rollout.diverged} (off the grid or not finite); "
