@@ -54,8 +54,8 @@ TOOLS = {
         "[-m] [+experiment=NAME] [key=value …] [--cfg]; nsf run … --dry-run is the same",
     ),
     "init": (
-        "a project of yours: a law, a scene with a mesh, an experiment and a test, outside nsf's tree",
-        "FOLDER [mesh=FILE unit=m|cm|mm [up=z]]; a new or empty folder, whose scene is scaled to your mesh",
+        "a project of yours in a new or empty folder, its scene scaled to your mesh",
+        "FOLDER [mesh=FILE unit=m|cm|mm [up=z]]",
     ),
     "runs": ("every run there is: listed, shown, compared, verified, deleted", None),
     "index": (
@@ -79,12 +79,13 @@ _OVERVIEW = """\
 usage: nsf COMMAND [key=value …]      nsf COMMAND --help says more
 
 a project of yours:
-  nsf init FOLDER mesh=FILE unit=mm   around your mesh; FOLDER/README.md goes on
-  nsf plan scene=NAME                 what a run does, and how long it takes
-  nsf run scene=NAME                  simulate, train, deploy, evaluate, report
+  nsf init FOLDER mesh=FILE unit=mm       around your mesh
+  cd FOLDER; pip install -e .             README.md there says what to change
+  nsf run --config-dir conf scene=FOLDER  from simulation to report
 
-parts of a run:
-  simulate train teach deploy evaluate report    one by one
+around a run:
+  plan          what it does, and how long it takes
+  simulate train teach deploy evaluate report    its stages
   superresolve  the deployed fields at many more points
   point         a material along a deformation path
   search        keys that make errors small

@@ -92,8 +92,8 @@ def test_the_mesh_of_the_template_gives_its_scene(tmp_path):
     plain, scaled = (
         [float(n) for n in re.findall(r"\d+\.\d+", re.sub("#.*", "", text))]
         for text in (
-            (tmp_path / "plain/conf/scene/plain.yaml").read_text(),
-            (tmp_path / "scaled/conf/scene/scaled.yaml").read_text(),
+            "".join((tmp_path / f"{name}/conf/scene/{file}.yaml").read_text() for file in (name, "body"))
+            for name in ("plain", "scaled")
         )
     )
     np.testing.assert_allclose(scaled, plain, rtol=0.05)

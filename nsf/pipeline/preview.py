@@ -75,10 +75,8 @@ def stages_table(pipelines: Sequence[Pipeline]) -> Table:
     guessed = not any(stage.time.like for stage in due)
     rows = [_row(stage, guessed) for stage in stages]
     if due:
-        low, high = (sum(getattr(stage.time, end) for stage in due) for end in ("low", "high"))
-        span = Interval(low + START / 2, high + 2 * START * crowding())
         size = bytes_text(sum(stage.size for stage in due))
-        rows.append(["in all", "", "", _span(span), size, "a guess" if guessed else ""])
+        rows.append(["in all", "", "", time_of(due), size, "a guess" if guessed else ""])
     columns = [column for column in zip(_HEADINGS, *rows, strict=True) if any(column[1:])]
     for heading, *_ in columns:
         side = "right" if heading in ("time", "disk") else "left"
@@ -86,6 +84,13 @@ def stages_table(pipelines: Sequence[Pipeline]) -> Table:
     for cells in zip(*(column[1:] for column in columns), strict=True):
         table.add_row(*map(escape, cells))
     return table
+
+
+def time_of(stages: Sequence[Stage]) -> str:
+    """The expected time of a command that does all of some stages, as `0.6–5.9 min`."""
+    due = [stage.time for stage in stages if stage.missing]
+    low, high = sum(time.low for time in due), sum(time.high for time in due)
+    return _span(Interval(low + START / 2, high + 2 * START * crowding()))
 
 
 def _row(stage: Stage, guessed: bool) -> list[str]:

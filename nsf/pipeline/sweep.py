@@ -69,6 +69,10 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         pipeline.check_report_folder()
     pipeline.group = group
     needs_others = len(stages) > 1 and not pipeline.complete(stages)
+    if needs_others and not group:
+        from nsf.pipeline.preview import stages_of, time_of
+
+        say(f"run: {time_of(stages_of([pipeline.check()]))} to go; `nsf plan` says of what")
     with pipeline.tracked, reserving(pipeline.inputs if needs_others else ()):
         for at, name in enumerate(stages):
             with timed(name):
