@@ -334,12 +334,17 @@ class Programs:
             far += change.reach(base + far * down, duration)
         return far
 
-    def check(self, names: Sequence[str], duration: float, dt: float, dx: float) -> None:
-        """Refuse programs of colliders that are not there, or that cross more than a cell in a step.
+    def check(
+        self, names: Sequence[str], gravity: Sequence[float], duration: float, dt: float, dx: float
+    ) -> None:
+        """Refuse curves that fail, programs of no collider, and those that cross more than a cell in a step.
 
         Raises:
             ConfigError: names the program.
         """
+        for change in self.gravity.values():
+            if isinstance(change, GravityCurve):
+                change.of(Gravity.constant(gravity), duration, np.random.default_rng(0))
         for name, drive in self.colliders.items():
             where = f"scene.forcing.colliders.{name}"
             if name not in names:

@@ -76,7 +76,7 @@ class Scene:
             raise ConfigError("scene.bodies={} leaves nothing to simulate; give a body")
         self._set(bodies={name: self._fitted(name, body) for name, body in self.bodies.items()})
         GridGeometry.of_domain(self.size, self.dx)
-        self.forcing.check(tuple(self.colliders), self.duration, self.dt, self.dx)
+        self.forcing.check(tuple(self.colliders), self.gravity, self.duration, self.dt, self.dx)
         check_parameters(self, self.parameters)
 
     def _set(self, **values: Any) -> None:
