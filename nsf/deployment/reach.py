@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from nsf.deployment.bound import LEVEL
 from nsf.recurrence.solids import FEATURES
 from nsf.vectors import drawn
 
@@ -17,8 +18,6 @@ _ROUND_OFF = 1e-6
 _AGAIN = 2.0
 #: Of the size of the ranges of latent states: what a run may leave them by, at least and at most.
 _LEAST, _MOST = 0.1, 1.0
-#: Share of runs that are usual.
-_USUAL = 0.95
 #: States of runs by which others are judged, at most, and frames of a run that are looked at, about.
 _ROWS, _FRAMES = 1024, 64
 
@@ -105,7 +104,8 @@ class Usual:
 
     Attributes:
         rows: [K, r] [m] states of half of the runs.
-        leeway: distance [m] to the nearest of these that 95 % of the other half never pass.
+        leeway: distance [m] to the nearest of these that a share of `LEVEL` of the other half never passes, as of
+            the runs in which a bound holds.
         every: steps from one frame that is looked at to the next.
     """
 
@@ -119,7 +119,7 @@ class Usual:
         every = max(1, runs.shape[1] // _FRAMES)
         frames = runs[:, ::every]
         judges, others = frames[::2].reshape(-1, frames.shape[2]), frames[1::2]
-        rank = math.ceil((len(others) + 1) * _USUAL - 1e-9)
+        rank = math.ceil((len(others) + 1) * LEVEL - 1e-9)
         if rank > len(others):
             return None
         rows = judges[drawn(len(judges), _ROWS)]

@@ -115,7 +115,7 @@ def fallen(count, of=100):
     return runs
 
 
-def test_a_run_is_usual_that_keeps_as_near_to_others_as_nineteen_of_twenty_do():
+def test_a_run_is_usual_that_keeps_as_near_to_others_as_nine_of_ten_do():
     usual, rare = Usual.of(fallen(1)), LATENTS + T[:, None] * [0.3, 0.7]
     assert 0.0 < usual.leeway < 0.1
     assert not usual.left(LATENTS, 1).any()
@@ -127,8 +127,8 @@ def test_a_run_is_usual_that_keeps_as_near_to_others_as_nineteen_of_twenty_do():
 
 
 def test_too_few_runs_say_nothing_of_what_is_usual():
-    assert Usual.of(fallen(1)[:37]) is None
-    assert Usual.of(fallen(1)[:38]) is not None
+    assert Usual.of(fallen(1)[:17]) is None
+    assert Usual.of(fallen(1)[:18]) is not None
 
 
 def test_a_run_within_what_was_taught_has_the_bound_of_validation():
