@@ -97,15 +97,15 @@ class Band:
 
 @dataclass(frozen=True)
 class Usual:
-    """Latent states of runs that taught a model, and how near to them others of these runs keep.
+    """Latent states of runs that taught a model, and how near to others each of these runs keeps.
 
-    A range says little where a few runs go far: one of twenty falls over, say, and widens it for all. So half
-    of the runs judge how far the others go from them, and a new run is usual that goes no further than most.
+    A range says little where a few runs go far: one of twenty falls over, say, and widens it for all. So each
+    run is held to the states of all others, and a new one is usual that goes no further than most of them.
 
     Attributes:
-        rows: [K, r] [m] states of half of the runs.
-        leeway: distance [m] to the nearest of these that a share of `LEVEL` of the other half never passes, as of
-            the runs in which a bound holds.
+        rows: [K, r] [m] states of all runs.
+        leeway: distance [m] to the nearest of the others that a share of `LEVEL` of the runs never passes, as
+            of those in which a bound holds.
         every: steps from one frame that is looked at to the next.
     """
 
@@ -114,17 +114,22 @@ class Usual:
     every: int = 1
 
     @classmethod
-    def of(cls, runs: np.ndarray) -> "Usual | None":
-        """Of latent states [R, N + 1, r] [m] of runs; None of too few to say what is usual."""
-        every = max(1, runs.shape[1] // _FRAMES)
-        frames = runs[:, ::every]
-        judges, others = frames[::2].reshape(-1, frames.shape[2]), frames[1::2]
-        rank = math.ceil((len(others) + 1) * LEVEL - 1e-9)
-        if rank > len(others):
+    def of(cls, runs: np.ndarray, every: int = 1) -> "Usual | None":
+        """Of latent states [R, N + 1, r] [m] of runs; None of too few to say what is usual.
+
+        Args:
+            runs: every so many steps.
+            every: steps from one of their frames to the next.
+        """
+        rank = math.ceil((len(runs) + 1) * LEVEL - 1e-9)
+        if rank > len(runs):
             return None
-        rows = judges[drawn(len(judges), _ROWS)]
-        farthest = np.sort([_nearest(one, rows).max() for one in others])
-        return cls(rows, float(farthest[rank - 1]), every)
+        apart = max(1, runs.shape[1] // _FRAMES)
+        frames = runs[:, ::apart]
+        chosen = drawn(frames.shape[0] * frames.shape[1], _ROWS)
+        rows, owners = frames.reshape(-1, frames.shape[2])[chosen], chosen // frames.shape[1]
+        farthest = [_nearest(one, rows[owners != run]).max() for run, one in enumerate(frames)]
+        return cls(rows, float(np.sort(farthest)[rank - 1]), every * apart)
 
     def left(self, rows: np.ndarray, every: int) -> np.ndarray:
         """[N] whether a run with states [N, r] [m] is further off, at each `every`-th; False at others."""

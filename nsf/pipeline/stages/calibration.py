@@ -89,7 +89,8 @@ def _calibration(validating, manifold: Manifold, trust: Trust, rollouts: Sequenc
 def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollout]) -> Reach:
     """Parameters, forcing and latent states of training runs, and of drawn ones."""
     scene = pipeline.scene
-    latents = manifold.training_latents.double().cpu().numpy()
+    latents, stored = manifold.training_latents.double().cpu().numpy(), pipeline.config.data.every
+    along = latents.reshape(len(pipeline.split.train), -1, latents.shape[1])
     runs, t = [scene.at(case) for case in pipeline.split.train], scene.dt * np.arange(scene.steps)
     if scene.forcing.gravity:  # what programs may add, rather than what those of training did
         acting, reach = (
@@ -98,13 +99,13 @@ def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollou
         )
     else:
         acting, reach = np.stack([run.acting_gravity.at(t) for run in runs]), 0.0
-    solids, usual = np.stack([collider_states(run.solids, scene.dt, scene.steps) for run in runs]), None
+    solids = np.stack([collider_states(run.solids, scene.dt, scene.steps) for run in runs])
     if isinstance(pipeline.model, Drawn) and pipeline.encoding.complete:
         lessons = encoded_runs(pipeline, manifold)
         latents = np.concatenate([latents, lessons.xhat.reshape(-1, latents.shape[1])])
+        along, stored = lessons.xhat, 1
         acting = acting if scene.forcing.gravity else lessons.inputs.gravity
         solids = lessons.inputs.solids
-        usual = Usual.of(lessons.xhat @ trust.metric) if pipeline.forced else None
     elif isinstance(pipeline.model, Drawn):
         pipeline.say("deploy: the encoded runs are gone; runs are held to those of training alone")
     gravity = acting.mean((0, 1))
@@ -115,7 +116,7 @@ def _reach(pipeline, manifold: Manifold, trust: Trust, rollouts: Sequence[Rollou
         radius=reach + float(np.linalg.norm(acting - gravity, axis=-1).max()),
         solids=Band.of_solids(solids, scene.dt) if scene.forcing.colliders else None,
         states=Band.of_states(latents @ trust.metric, [rollout.xhat @ trust.metric for rollout in rollouts]),
-        usual=usual,
+        usual=Usual.of(along @ trust.metric, stored) if pipeline.forced else None,
         changed=", ".join(pipeline.config.deploy.changes or ()),
     )
 
