@@ -278,12 +278,13 @@ class Pipeline(Configured):
             self.say(f"simulate: warning: {line}")
         if missing := {run for run in runs if run not in there and run not in needless}:
             with timed(START):
-                from nsf.pipeline.stages.simulation import simulate_missing
+                from nsf.pipeline.stages.simulation import helpers_ahead, simulate_missing
 
-            self.check()
-            with measured(self, "simulate") as works:
-                if simulate_missing(self, missing, warned) < len(missing) or needless:
-                    works.clear()
+            with helpers_ahead(self, missing) as pool:
+                self.check()
+                with measured(self, "simulate") as works:
+                    if simulate_missing(self, missing, warned, pool) < len(missing) or needless:
+                        works.clear()
         return runs
 
     def full_order(self, cases: Sequence[Case]) -> list[Run]:

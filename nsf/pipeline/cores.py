@@ -1,6 +1,7 @@
 """Helping processes, a core each, with which this one shares full-order runs on a CPU."""
 
 import contextlib
+import importlib
 import os
 import signal
 import time
@@ -80,7 +81,29 @@ class Helpers:
 
 
 @contextlib.contextmanager
-def helping(work: Callable[[int, Advance, Path], object], count: int, advance: Advance) -> Iterator[Helpers]:
+def ahead(count: int, module: str) -> Iterator[ProcessPoolExecutor | None]:
+    """Start processes for `helping`, which import a module while the block prepares; None for none."""
+    pool = _processes(count, module) if count else None
+    try:
+        if pool:
+            pool.submit(int)  # starts all
+        yield pool
+    finally:
+        if pool:
+            pool.shutdown(kill_workers=True)  # `helping` has waited for those with work
+
+
+def _processes(count: int, module: str = __name__) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(count, initializer=_begin, initargs=(module,), env={"OMP_NUM_THREADS": "1"})
+
+
+@contextlib.contextmanager
+def helping(
+    work: Callable[[int, Advance, Path], object],
+    count: int,
+    advance: Advance,
+    pool: ProcessPoolExecutor | None = None,
+) -> Iterator[Helpers]:
     """Let other processes work while the block does; each has one thread.
 
     Results do not depend on how many there are if they share out runs, and not parts of them.
@@ -89,6 +112,7 @@ def helping(work: Callable[[int, Advance, Path], object], count: int, advance: A
         work: of a process, by its number, what counts its steps and the folder of `claim`; importable.
         count: of the processes; 0 for none.
         advance: counts their steps here.
+        pool: of as many processes, started `ahead`; new ones by default.
     """
     with TemporaryDirectory(prefix="nsf-") as name:
         folder = Path(name)
@@ -96,7 +120,7 @@ def helping(work: Callable[[int, Advance, Path], object], count: int, advance: A
             yield Helpers(folder, (), advance)
             return
         np.zeros(count + 1, np.int64).tofile(folder / _STEPS)  # the last one tells all to stop
-        pool = ProcessPoolExecutor(count, initializer=_begin, env={"OMP_NUM_THREADS": "1"})
+        pool = pool or _processes(count)
         try:
             futures = [pool.submit(_work, work, number, folder) for number in range(count)]
             yield Helpers(folder, futures, advance)
@@ -114,9 +138,10 @@ def claimed(folder: Path, run: int) -> bool:
     return True
 
 
-def _begin() -> None:
-    """A helper leaves interrupts to the process that it helps."""
+def _begin(module: str) -> None:
+    """A helper leaves interrupts to the process that it helps, and imports what it will need."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    importlib.import_module(module)
 
 
 def _work(work: Callable[[int, Advance, Path], object], number: int, folder: Path) -> object:

@@ -90,7 +90,7 @@ class Ending(NamedTuple):
     warnings: Sequence[str]
 
 
-def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) -> int:
+def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], pool=None) -> int:
     """Run and store every job; each file appears when it is whole.
 
     Processes with the same jobs share them: what another one is making is left to it, and waited for at the
@@ -100,6 +100,7 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
         jobs: trajectories to be made.
         shared: what they have in common.
         say: called with a line on a trajectory that is waited for, or where something was odd.
+        pool: of the helpers, where they were started ahead.
 
     Returns:
         How many were made, here and by the helpers.
@@ -112,7 +113,7 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
     frames, help_with = len(jobs) * shared.frames, partial(_help, jobs, shared)
     with (
         Progress("simulate", frames, "frames") as progress,
-        helping(help_with, shared.helpers, progress.advance) as helpers,
+        helping(help_with, shared.helpers, progress.advance, pool) as helpers,
         ThreadPoolExecutor(_WRITERS) as pool,
     ):
 

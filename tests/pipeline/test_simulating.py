@@ -14,7 +14,6 @@ from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.gpu import without_collection
 from nsf.pipeline import cores, trajectories
-from nsf.pipeline.stages import simulation
 from nsf.progress import Progress
 
 
@@ -51,7 +50,7 @@ def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeyp
 def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_path, monkeypatch):
     """Bit for bit, and the bar ends at its total."""
     counted = []
-    monkeypatch.setattr(simulation, "helper_count", lambda *of: 1)
+    monkeypatch.setattr(cores, "helper_count", lambda *of: 1)
     monkeypatch.setattr(Progress, "advance", lambda self, count=1: counted.append(count))
     pipeline = pipeline_at(tmp_path)
     for run in pipeline.simulate():
@@ -62,9 +61,10 @@ def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_
     assert sum(counted) == len(pipeline.runs_of("simulate")) * (pipeline.scene.steps + 1)
 
 
-def test_helping_processes_count_here():
+@pytest.mark.parametrize("early", [0, 1])
+def test_helping_processes_count_here(early):
     steps = []
-    with cores.helping(helped.count, 1, steps.append) as helpers:
+    with cores.ahead(early, "helped") as pool, cores.helping(helped.count, 1, steps.append, pool) as helpers:
         assert cores.claimed(helpers.folder, 1)
         ((number, process, claimed),) = helpers.results()
         assert not cores.claimed(helpers.folder, 0)
@@ -80,6 +80,13 @@ def test_an_error_of_another_process_is_one_here():
 def test_processes_end_where_this_one_fails():
     with pytest.raises(KeyboardInterrupt), cores.helping(helped.go_on, 1, lambda steps: None):
         raise KeyboardInterrupt
+
+
+def test_processes_that_got_no_work_end():
+    with cores.ahead(1, "helped") as pool:
+        process = pool.submit(os.getpid).result()
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)
 
 
 def test_a_launcher_says_how_many_cores_there_are(monkeypatch):
