@@ -24,7 +24,19 @@ if TYPE_CHECKING:
         RandomTilt,
     )
     from nsf.scenes.scene import Scene
-    from nsf.scenes.shapes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, Shape, TentacleBall, mesh_or_ball
+    from nsf.scenes.shapes import (
+        Ball,
+        Box,
+        Cylinder,
+        Frame,
+        Lattice,
+        Mesh,
+        QuarterCylinder,
+        Ribbon,
+        Shape,
+        TentacleBall,
+        mesh_or_ball,
+    )
     from nsf.scenes.weakness import Weakness
 
 __all__ = [
@@ -40,10 +52,12 @@ __all__ = [
     "Inclination",
     "Keyframes",
     "LatinHypercube",
+    "Lattice",
     "Mesh",
     "MotionProgram",
     "Parameter",
     "Programs",
+    "QuarterCylinder",
     "RandomPress",
     "RandomPush",
     "RandomShake",

@@ -5,7 +5,7 @@ import pytest
 
 from nsf import load_scene
 from nsf.errors import ConfigError
-from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall
+from nsf.scenes import Ball, Box, Cylinder, Frame, Lattice, QuarterCylinder, Ribbon, TentacleBall
 from nsf.scenes.shapes import geometry
 
 WAVE = [(0.2 + 0.6 * t, 0.5 + 0.06 * np.sin(9.0 * t), 0.4 + 0.1 * t * t) for t in np.linspace(0.0, 1.0, 40)]
@@ -15,6 +15,7 @@ SHAPES = [
     pytest.param(Box((0.1, 0.2, 0.3), (0.5, 0.4, 0.9)), id="box"),
     pytest.param(Cylinder((0.5, 0.5, 0.13), 0.2, 0.3), id="cylinder"),
     pytest.param(Cylinder((0.5, 0.5, 0.13), 0.02, 0.4), id="thin cylinder"),
+    pytest.param(QuarterCylinder((0.5, 0.5, 0.13), 0.2, 0.3), id="quarter cylinder"),
     pytest.param(Ball((0.5, 0.4, 0.3), 0.2), id="ball"),
     pytest.param(Frame((0.2, 0.4, 0.3), (0.8, 0.6, 0.7), 0.1), id="frame"),
     pytest.param(Ribbon(ZIGZAG, 0.06), id="bent ribbon"),
@@ -78,6 +79,19 @@ class TestSampling:
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         counted = shape.contains(grid).mean() * np.prod(upper - lower)
         assert shape.volume == pytest.approx(counted, rel=0.01)
+
+
+def test_a_lattice_is_filled_first():
+    """Its points are at the centres of cubes; more points go on evenly, fewer are spread without holes."""
+    box = Lattice((0.1, 0.1, 0.1), (0.3, 0.2, 0.4), spacing=0.05)
+    lattice, more, fewer = box.sample(48), box.sample(60), box.sample(20)
+    assert np.allclose(np.unique(lattice[:, 0]), [0.125, 0.175, 0.225, 0.275])
+    assert len(np.unique(lattice.round(9), axis=0)) == 48
+    assert np.array_equal(more[:48], lattice)
+    assert np.array_equal(box.sample(12, 48), more[48:])
+    assert np.array_equal(fewer, Box(box.lower, box.upper).sample(20))
+    with pytest.raises(ConfigError, match="lattice spacing"):
+        Lattice((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), spacing=0.0)
 
 
 def test_no_points_are_refused():
