@@ -142,7 +142,7 @@ def _tool(name: str, arguments: list[str]) -> int:
     tools = {
         "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index, "init": _init,
         "plan": _plan,
-        "reports": _reports, "runs": _runs, "search": _search,
+        "reports": _reports, "runs": _runs, "search": _search, "validate": _validate,
     }  # fmt: skip
     return tools[name](arguments)
 
@@ -163,6 +163,18 @@ def _bench(arguments: list[str]) -> int:
     folder = options.pop("folder", reports_folder("speed"))
     page = bench(folder, options, lambda text: print(text, file=sys.stderr))
     screen().print(table(page.with_name("bench.csv")))
+    return _open(page)
+
+
+def _validate(arguments: list[str]) -> int:
+    """Full-order runs beside published answers."""
+    readers = dict.fromkeys(("problems", "scale", "device", "folder"), words.text)
+    options = words.values("validate", arguments, readers)
+    from nsf.validation.command import terminal, validate
+
+    folder = options.pop("folder", reports_folder("validation"))
+    page = validate(folder, options, lambda text: print(text, file=sys.stderr))
+    screen().print(terminal(page))
     return _open(page)
 
 

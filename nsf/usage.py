@@ -72,6 +72,11 @@ TOOLS = {
         "[device=auto] [trials=10] [folder=PATH]; benches are whole, full_order, scaling, reduced, batch, "
         "recurrence, training and peers; all, and sizes that suit the device, by default",
     ),
+    "validate": (
+        "problems with published answers at full order, and both in a table; writes reports/validation",
+        "[problems=taylor_bar,cantilever,discs,settling,collapse,incline] [scale=small|paper] [device=cpu] "
+        "[folder=PATH]; all problems by default, in some minutes on a CPU",
+    ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
 #: Of `nsf --help`; `nsf COMMAND --help` has the details.

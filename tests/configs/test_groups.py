@@ -13,10 +13,13 @@ from nsf.paths import CONF, groups
 from nsf.pipeline import Pipeline
 from nsf.scenes.checks import check_physics
 from nsf.scenes.resolution import resolution_warnings
+from nsf.validation import PROBLEMS
 
 GROUPS = groups()
 #: A scene sets its material's constants, so a law alone is composed with the material point.
 APART = ("scene", "material", "hydra/launcher")
+#: Scenes; those of published problems run in tests/validation.
+SCENES = [pytest.param(n, marks=[pytest.mark.slow] * (n in PROBLEMS)) for n in GROUPS["scene"]]
 CHAIN = [[f"{g}={option}" for option in GROUPS[g]] for g in GROUPS if g not in APART]
 
 
@@ -39,7 +42,7 @@ def test_launcher_composes(name):
 
 
 @pytest.mark.parametrize("scale", ["small", pytest.param("paper", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", GROUPS["scene"])
+@pytest.mark.parametrize("name", SCENES)
 def test_scene_is_runnable(name, scale):
     """In the cases at the ends of each range: particles in the domain, a stable step, no body in another."""
     scene = Pipeline(config.load([f"scene={name}", f"scale={scale}", "device=cpu"])).check().scene

@@ -1,0 +1,9 @@
+"""Problems with published answers: `nsf validate` runs them at full order and tables both.
+
+A problem is a scene, `conf/scene/NAME.yaml`, and a module of its name with `TITLE`, `LIMITS` (a sentence on
+what keeps the answer off) and `answers(scene, device)`, which gives an `Answer` for each published quantity.
+"""
+
+from nsf.validation.command import PROBLEMS, validate
+
+__all__ = ["PROBLEMS", "validate"]

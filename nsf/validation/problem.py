@@ -1,0 +1,73 @@
+"""The parts that the problems share: an answer, rest by dynamic relaxation, positions of material points."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from nsf.mpm import FullOrderMPM
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One quantity as published and as computed.
+
+    Attributes:
+        quantity: its name; unit: its unit.
+        published: the value, or the values whose spread counts as agreement.
+        source: of the published values.
+        computed: by a full-order run.
+    """
+
+    quantity: str
+    unit: str
+    published: tuple[float, ...]
+    source: str
+    computed: float
+
+    @property
+    def difference(self) -> float:
+        """[%] from the nearest published value, 0 within their spread; where 0 is published, in the unit."""
+        low, high = min(self.published), max(self.published)
+        nearest = min(max(self.computed, low), high)
+        return 100.0 * (self.computed / nearest - 1.0) if nearest else self.computed
+
+
+def relax(solver: FullOrderMPM, load: Callable[[], object] = lambda: None, still: float = 1e-8) -> None:
+    """Bring a body to rest by kinetic damping: at each peak of kinetic energy all velocities become zero.
+
+    Args:
+        solver: at any state.
+        load: called before each step.
+        still: share of the highest peak of kinetic energy at which the body counts as at rest.
+    """
+    before = highest = 0.0
+    while True:
+        for _ in range(_BETWEEN):
+            load()
+            solver.step()
+        energy = kinetic_energy(solver)
+        if energy < before:
+            solver.state.v.rows.zero_()
+            solver.state.C.rows.zero_()
+            if before < still * highest:
+                return
+            highest, energy = max(highest, before), 0.0
+        before = energy
+
+
+_BETWEEN = 10  # steps from a look at the kinetic energy to the next
+
+
+def kinetic_energy(solver: FullOrderMPM) -> float:
+    """Σ ½ m |v|² [J]."""
+    v = solver.state.v.numpy().astype(float)
+    return float(0.5 * solver.constants.mass @ (v**2).sum(1))
+
+
+def position(solver: FullOrderMPM, X: np.ndarray) -> np.ndarray:
+    """[3] where the material point X [3] [m] is, by a linear fit to the particles that were within 1.5 Δx."""
+    arms = solver.constants.X - X
+    near = np.abs(arms).max(1) < 1.5 * solver.grid.geometry.dx
+    terms = np.column_stack([np.ones(near.sum()), arms[near]])
+    return np.linalg.lstsq(terms, solver.state.x.numpy()[near].astype(float), rcond=None)[0][0]
