@@ -13,7 +13,7 @@ class Law(IsotropicHardening):
     """Voce hardening, from `yield_stress` to 1 + `gain` times it; `E` and `nu` are inherited."""
 
     yield_stress: float  # [Pa]
-    gain: float = 1.0
+    gain: float = 4.0
     rate: float = 20.0
 
     def flow_stress(self, gamma):
