@@ -153,16 +153,17 @@ class RestrictedField:
         stay in the cache.
         """
         modes, mean = self.modes.flatten(0, 1), self.mean.flatten()
-        size = min(len(inputs), frames_at_once(len(mean), mean.dtype, mean.device))
+        (values, K), frames = modes.shape, inputs.shape[0]
+        size = max(1, min(frames, frames_at_once(values, mean.dtype, mean.device)))
         with torch.no_grad():
-            a, memory = self._coefficients(inputs), mean.new_empty(size, len(mean))
+            a, memory = self._coefficients(inputs), mean.new_empty(size, values)
             tensor_cores = tolerance > 0 and mean.is_cuda and mean.dtype == torch.float32
-            tensor_cores &= len(a) * len(mean) >= _MANY
-            fast = tensor_cores and tf32_error(a[:: max(1, len(a) // 16)], modes) <= tolerance
-        width = len(mean) if mean.is_cuda else max(1, TILE // modes.shape[1])
-        tiles = [slice(start, start + width) for start in range(0, len(mean), width)]
-        for part in a.split(max(1, size)):
-            block = memory[: len(part)]
+            tensor_cores &= frames * values >= _MANY
+            fast = tensor_cores and tf32_error(a[:: max(1, frames // 16)], modes) <= tolerance
+        width = values if mean.is_cuda else max(1, TILE // K)
+        tiles = [slice(start, start + width) for start in range(0, values, width)]
+        for part in a.split(size):
+            block = memory[: part.shape[0]]
             with torch.no_grad(), tf32() if fast else contextlib.nullcontext():
                 for rows in tiles:
                     torch.addmm(mean[rows], part, modes[rows].T, out=block[:, rows])
@@ -171,9 +172,20 @@ class RestrictedField:
     def _coefficients(self, inputs: Tensor, rate: Tensor | None = None) -> Tensor:
         a = [inputs[..., : self.leading]] if self.leading or self.network is None else []
         if self.network is not None:
-            outputs = self.network(inputs)
+            outputs = self._outputs(inputs)
             a.append(at_rate(outputs, self._checked(rate)) if self.rates else outputs)
         return torch.cat(a, -1) if len(a) > 1 else a[0]
+
+    def _outputs(self, inputs: Tensor) -> Tensor:
+        """The network's outputs; to call its modules takes twice as long as to launch their kernels."""
+        *hidden, last = self._layers
+        for layer in hidden:
+            inputs = self.network.activation(F.linear(inputs, *layer))
+        return F.linear(inputs, *last)
+
+    @functools.cached_property
+    def _layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(layer.weight, layer.bias) for layer in self.network.layers]
 
     def _checked(self, rate: Tensor | None) -> Tensor:
         if rate is None:

@@ -74,9 +74,10 @@ class FullyConnected(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """[..., inputs] → [..., outputs]."""
-        for layer in self.layers[:-1]:
+        *hidden, last = self.layers  # a slice would make a module
+        for layer in hidden:
             inputs = self.activation(layer(inputs))
-        return self.layers[-1](inputs)
+        return last(inputs)
 
     def forward_and_tangents(self, inputs: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
         """The outputs and their derivative along each tangent, in one pass and without autograd.
@@ -88,11 +89,11 @@ class FullyConnected(nn.Module):
         Returns:
             outputs [..., outputs] and derivatives [..., d, outputs].
         """
-        for layer in self.layers[:-1]:
+        *hidden, last = self.layers
+        for layer in hidden:
             z = layer(inputs)
             tangents = self.push(F.linear(tangents, layer.weight), z.unsqueeze(-2))
             inputs = self.activation(z)
-        last = self.layers[-1]
         outputs, tangents = last(inputs), F.linear(tangents, last.weight)
         return outputs, tangents.expand(*outputs.shape[:-1], *tangents.shape[-2:])
 
