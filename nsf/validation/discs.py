@@ -10,7 +10,7 @@ from nsf.validation.problem import Answer, kinetic_energy
 
 TITLE = "Collision of two elastic discs"
 LIMITS = "APIC, which loses energy in the collision."
-_SOURCE = "Sulsky et al. 1994"
+_SOURCE = "Sulsky"
 _LOOKS = 70  # at the energy, in a run
 
 

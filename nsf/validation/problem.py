@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsf.mpm import FullOrderMPM
+from nsf.scenes import Box, Scene
 
 
 @dataclass(frozen=True)
@@ -71,3 +72,9 @@ def position(solver: FullOrderMPM, X: np.ndarray) -> np.ndarray:
     near = np.abs(arms).max(1) < 1.5 * solver.grid.geometry.dx
     terms = np.column_stack([np.ones(near.sum()), arms[near]])
     return np.linalg.lstsq(terms, solver.state.x.numpy()[near].astype(float), rcond=None)[0][0]
+
+
+def spread(scene: Scene, body: str) -> Scene:
+    """The scene with the particles of a body spread evenly, as in other scenes, in place of on a lattice."""
+    lattice = scene.bodies[body].shape
+    return scene.changed({f"bodies.{body}.shape": Box(lattice.lower, lattice.upper)})

@@ -8,7 +8,10 @@ from nsf.scenes import Scene
 from nsf.validation.problem import Answer, position
 
 TITLE = "Taylor bar, copper, 227 m/s"
-LIMITS = "the grid."
+LIMITS = (
+    "cells and time step: APIC loses energy at each step, so that shorter steps make the foot smaller; finer "
+    "cells make it larger."
+)
 
 
 def answers(scene: Scene, device: str) -> Iterator[Answer]:
