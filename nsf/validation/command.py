@@ -29,6 +29,7 @@ _OFF = (
     "off: from the nearest published value, 0 within their spread; where 0 is published, the value itself. "
     "s: CPU time of all runs of the problem."
 )
+_TICKS = (-50, -20, -10, -5, -2, -1, 0, 1, 2, 5, 10, 20, 50)
 _CHART = "How far off each quantity is; the band is 2 %."
 
 
@@ -82,31 +83,26 @@ def _rows(name: str, options: Mapping[str, str], say: Callable[[str], object]) -
 
 
 def table(frame: pd.DataFrame) -> Rows:
-    """The table of the page and of `nsf reports`."""
-    quantity = [
-        f"{q} [{unit}]" if unit != "-" else q
-        for q, unit in zip(frame["quantity"], frame["unit"], strict=True)
-    ]
-    titles = frame["problem"].map(lambda name: import_module(f"nsf.validation.{name}").TITLE)
-    shown = {"problem": titles.where(~frame["problem"].duplicated(), ""), "quantity": quantity}
-    names = {
-        "computed": "ours",
-        "off": "off [%]",
-        "cell": "cell [m]",
-        "particles": "particles",
-        "seconds": "s",
-    }
-    shown |= {"published": frame["published"]} | {head: frame[key].map(number) for key, head in names.items()}
-    columns = [list(values) for values in (*shown.values(), frame["source"])]
-    return Rows(
-        [*shown, "source"],
-        [list(row) for row in zip(*columns, strict=True)],
-        [False] * 2 + [True] * 6 + [False],
-    )
+    """The table of the page and of `nsf reports`; facts of a problem stand in its first row."""
+    first, titles = ~frame["problem"].duplicated(), frame["problem"].map(_title)
+    units = frame["unit"].map(lambda unit: f" [{unit}]" if unit != "-" else "")
+    columns = {"problem": titles.where(first, ""), "quantity": frame["quantity"] + units}
+    columns |= {"published": frame["published"]}
+    columns |= {"ours": frame["computed"].map(number), "off [%]": frame["off"].map(number)}
+    for heading, key in (("cell [m]", "cell"), ("s", "seconds"), ("particles", "particles")):
+        columns[heading] = frame[key].map(number).where(first, "")
+    columns["source"] = frame["source"]
+    body = [list(row) for row in zip(*columns.values(), strict=True)]
+    return Rows(list(columns), body, [name not in ("problem", "quantity", "source") for name in columns])
+
+
+def _title(name: str) -> str:
+    """The title of a problem."""
+    return import_module(f"nsf.validation.{name}").TITLE
 
 
 def chart(frame: pd.DataFrame) -> Figure:
-    """A point a quantity at how far it is off [%], on a scale that is linear within 1 %."""
+    """A point a quantity at how far it is off [%], on a scale that is linear within 2 %."""
     frame = frame.dropna(subset="off")
     with styled():
         fig = figure(0.8 + 0.24 * len(frame))
@@ -114,8 +110,9 @@ def chart(frame: pd.DataFrame) -> Figure:
         panel.axvspan(-2.0, 2.0, color=PALETTE[0], alpha=0.15, lw=0)
         panel.axvline(0.0, color=INK, lw=0.8)
         panel.plot(frame["off"], at, "o", color=PALETTE[0])
-        panel.set_xscale("symlog", linthresh=1.0)
-        panel.xaxis.set_major_formatter("{x:g}")
+        panel.set_xscale("symlog", linthresh=2.0)
+        panel.set_xlim(-60.0, 60.0)
+        panel.set_xticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
         panel.set(yticks=at, yticklabels=frame["problem"].str.replace("_", " ") + ": " + frame["quantity"])
         panel.set(xlabel="off [%]", ylim=(len(frame) - 0.5, -0.5))
         panel.grid(axis="x")
@@ -134,8 +131,8 @@ def _write(folder: Path, frame: pd.DataFrame) -> Path:
     made = "; ".join(
         f"{device}, {commit}" for device, commit in zip(made["device"], made["commit"], strict=True)
     )
-    limits = [(import_module(f"nsf.validation.{name}").TITLE, text) for name, text in
-              frame[["problem", "limits"]].drop_duplicates().itertuples(index=False)]  # fmt: skip
+    stated = frame[["problem", "limits"]].drop_duplicates()
+    limits = [(_title(name), text) for name, text in stated.itertuples(index=False)]
     with replaced(folder) as fresh:
         frame.to_csv(fresh / FILE, index=False)
         save(chart(frame), fresh, "off", kinds=("png",))
