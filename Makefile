@@ -131,13 +131,12 @@ calibration: install  ## the reports of calibration, sensitivities and design, o
 	$(BIN)/nsf design run=block x@0.4:0.4:0.26=0.42 tilt=30 knots=4 E=6000 density=100 device=cpu \
 		folder=reports/design_block
 
-# Runs by recurrence at small scale, as table1/small and forcing have them.
-models: install  ## write the models of nsf demo: make models block=DEPLOY_ID sand=DEPLOY_ID metal=DEPLOY_ID
-	@[ -n "$(block)$(sand)$(metal)" ] || { echo 'name a run: make models block=ID' >&2; exit 2; }
-	for m in block sand metal; do case $$m in block) id='$(block)';; sand) id='$(sand)';; metal) id='$(metal)';; esac; \
-		[ -z "$$id" ] || $(BIN)/python -c "from pathlib import Path; from nsf.live.publish import Sizes, ship; \
-		from nsf.runs import Run; ship(Run.named('$$id', 'deploy'), Path('nsf/live/models/$$m.bin'), 1300, \
-		Sizes(modes=24, stress=200_000, runs=2, points=500, frames=30))" || exit; done
+# Runs by recurrence at small scale, as forcing (seed 0) and table1/small have them.
+models: install  ## write the models of nsf demo: make models block=DEPLOY_ID tray=DEPLOY_ID metal=DEPLOY_ID
+	@[ -n "$(block)$(tray)$(metal)" ] || { echo 'name a run: make models block=ID' >&2; exit 2; }
+	for m in block=$(block) tray=$(tray) metal=$(metal); do [ -z "$${m#*=}" ] || $(BIN)/python -c "from pathlib import Path; \
+		from nsf.live.publish import ship; from nsf.runs import Run; \
+		ship(Run.named('$${m#*=}', 'deploy'), Path('nsf/live/models/$${m%=*}.bin'))" || exit; done
 
 docs: develop  ## the documentation, in site/
 	OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build --strict

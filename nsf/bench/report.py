@@ -15,6 +15,7 @@ from nsf.results.charts.costs import bars
 from nsf.results.columns import axis, number
 from nsf.results.formats import Rows, TerminalTable, markdown_document
 from nsf.results.style import (
+    DASHES,
     FULL,
     INK,
     band,
@@ -194,8 +195,9 @@ def steps_over(
     fig = figure(4.4)
     panel = fig.subplots()
     panel.set(xscale="log", yscale="log", xlabel=label, ylabel=f"time of {y} [ms]")
-    for i, (name, part) in enumerate(by):
-        part, style = part.sort_values(x), {"marker": "o", "ms": 4.5, "label": name, **line_style(i)}
+    by = list(by)
+    for (name, part), line in zip(by, _lines([name for name, _ in by]), strict=True):
+        part, style = part.sort_values(x), {"marker": "o", "ms": 4.5, "label": name, **line}
         band(panel, part[x], part["median"], part["p10"], part["p90"], **style)
     plain_ticks(panel.yaxis)
     sizes = sorted(rows[x].unique())
@@ -206,6 +208,18 @@ def steps_over(
         plain_ticks(panel.xaxis, lambda count: size_name(round(count)))
     panel.grid(which="major")
     return fig, panel
+
+
+def _lines(names: list[str]) -> list[dict]:
+    """Colour and dash of lines: shades of the colour of their solver where their names begin with one."""
+    solvers = {"reduced": "projected", "full-order": "full"}
+    of = [next((model for start, model in solvers.items() if name.startswith(start)), "") for name in names]
+    if not all(of):
+        return [line_style(i) for i in range(len(names))]
+    return [
+        {"color": model_color(model, of[:i].count(model), of.count(model)), "ls": DASHES[i % 2]}
+        for i, model in enumerate(of)
+    ]
 
 
 def step_over_particles(rows: pd.DataFrame) -> Figure:
@@ -239,15 +253,15 @@ def step_over_sample(rows: pd.DataFrame) -> Figure:
             steps, "sample", "sample particles |S| [–]", ((f"reduced, {p}", part) for p, part in groups)
         )
         for i, (precision, part) in enumerate(groups):
-            color = line_style(i)["color"]
+            color, gray = (model_color(model, i, len(groups)) for model in ("projected", "full"))
             both = part.merge(deltas, on=["case", "precision"])
             for at, ms, delta in zip(both["sample_x"], both["median_x"], both["median_y"], strict=True):
                 panel.annotate(
-                    f"{number(100 * delta)} %", (at, ms), (0, 6 - 18 * (i == 0)), ha="center",
+                    f"{number(100 * delta)} %", (at, ms), (0, 9 - 24 * (i == 0)), ha="center",
                     textcoords="offset points", fontsize=8.5, color=color,
                 )  # fmt: skip
             for ms in full.loc[full["precision"] == precision, "median"]:
-                panel.axhline(ms, ls=":", lw=1.4, color=color, label=f"full-order, {precision}")
+                panel.axhline(ms, ls=":", lw=1.6, color=gray, label=f"full-order, {precision}")
         legend(fig)
     return fig
 

@@ -12,7 +12,7 @@ from nsf.storage import write_text
 #: Title of each model that is shipped; the first is shown unless another is asked for.
 MODELS = {
     "block": "Soft block under gravity that wanders",
-    "sand": "Sand column",
+    "tray": "Sand in a tray that is tilted and shaken",
     "metal": "Squeezed metal frame",
 }
 

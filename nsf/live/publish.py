@@ -2,7 +2,7 @@
 
 import itertools
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +10,12 @@ import torch
 
 from nsf.data import Case
 from nsf.data.trajectory import Trajectory
+from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError
 from nsf.evaluation.metrics import von_mises
 from nsf.live import page
 from nsf.live.model import LiveModel
+from nsf.live.surface import surface
 from nsf.live.wire import check_field, modal_field, shown
 from nsf.models import Model, Recurrence
 from nsf.pipeline import Pipeline
@@ -27,6 +29,7 @@ from nsf.vectors import spaced
 
 #: Points of a page, by default; a telephone decodes so many in each frame.
 POINTS = 20_000
+SHIPPED_POINTS = 3500  # of a page of the package
 #: Largest page [bytes], which still goes by mail.
 LARGEST = 16_000_000
 _SAME = 1e-9
@@ -68,7 +71,7 @@ class Sizes:
     modes: int | None = None
     stress: int = 4_000_000
     runs: int = 3
-    points: int = 2000
+    points: int = 4000
     frames: int = 50
 
 
@@ -91,6 +94,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]
     arrays = {"rest": model.X}
+    corners = _surface(model, arrays)
     header["fields"] = _fields(model, arrays, header, sizes, stress)
     arrays |= recurrence_arrays(recurrence.form)
     batch = pipeline.batch_at(model.manifold, [model.initial], precision="fp64")
@@ -105,19 +109,23 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
         "trust": model.trust.plain,
         "recordings": {},
     }  # fmt: skip
-    header["cases"] = _cases(model, taught.parameters, arrays, header, sizes)
+    header["first"] = _surest(model)
+    header["cases"] = _cases(model, taught.parameters, arrays, header, sizes, corners)
     return model.title, page.packed(header, arrays)
 
 
-def ship(run: Run, path: Path, points: int, sizes: Sizes) -> None:
+#: How much goes into a page of the package.
+SHIPPED = Sizes(modes=24, stress=200_000, runs=1, points=3000, frames=30)
+
+
+def ship(run: Run, path: Path) -> None:
     """Write the data of a page alone, as `nsf demo` reads them.
 
     Args:
         run: complete deploy run by a recurrence.
         path: of the file.
-        points: how many are shown; sizes: as for `model_data`.
     """
-    _, data = model_data(LiveModel(run, points, "cpu", surface=True), sizes)
+    _, data = model_data(LiveModel(run, SHIPPED_POINTS, "cpu", surface=True), SHIPPED)
     with writing(path) as partial:
         partial.write_bytes(zlib.compress(data, 9))
 
@@ -149,9 +157,18 @@ def recurrence_arrays(form: Form) -> dict[str, np.ndarray]:
         first = torch.cat([before, of_states, after], 1), b - form.c_mean @ of_states
         for k, (weight, bias) in enumerate([first, *rest]):
             for member in range(form.sizes.members):
-                arrays[f"{name}{member}.weight{k}"] = weight[member].T.contiguous().numpy()
-                arrays[f"{name}{member}.bias{k}"] = bias[member].contiguous().numpy()
+                arrays[f"{name}{member}.weight{k}"] = weight[member].T.contiguous().float().numpy()
+                arrays[f"{name}{member}.bias{k}"] = bias[member].contiguous().float().numpy()
     return arrays
+
+
+def _surface(model: LiveModel, arrays: dict) -> np.ndarray | None:
+    """Put the surface of a body that has one into a page; gives the rows of its corners."""
+    found = surface(model.X, model.spacing, model.training_frames[0])
+    if found is None:
+        return None
+    arrays |= {"corners": found[0].astype(np.uint16), "faces": found[1].astype(np.uint16)}
+    return found[0]
 
 
 def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes, stress: int) -> dict:
@@ -163,7 +180,10 @@ def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes, stress: 
         stress_scale = {"title": "von Mises stress", "unit": "Pa", "top": model.tops["von_mises"]}
         header["quantities"] = {"von_mises": stress_scale} | header["quantities"]
     for phase, how in kinds.items():
-        description, values = modal_field(model.at.fields[phase], *how)
+        field = model.at.fields[phase]
+        if phase == "stress" and stress:  # its coordinates are in the state, so that no network gives them
+            field = replace(field, network=None)
+        description, values = modal_field(field, *how)
         descriptions[phase] = description | {"parameters": model.manifold.takes_parameters(phase)}
         arrays |= {f"{phase}.{name}": a for name, a in values.items()}
     return descriptions
@@ -213,9 +233,13 @@ def _tilt(model: LiveModel, recurrence: RecurrenceEngine) -> dict | None:
     return {"down": down.tolist(), "angle": max(angle, _LEAST_TILT)}
 
 
-def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) -> list[dict]:
+def _cases(
+    model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes, corners: np.ndarray | None
+) -> list[dict]:
     """The held-out cases: their parameters, forcing, and the full-order runs of some."""
-    pipeline, entries, movable = model.pipeline, [], _movable(model)
+    pipeline, entries, movable, first = model.pipeline, [], _movable(model), header["first"]
+    stored = [case for case in (pipeline.held_out[first], *pipeline.held_out) if case in model.simulated]
+    stored = list(dict.fromkeys(stored))[: sizes.runs]
     for index, case in enumerate(pipeline.held_out):
         scene = pipeline.deployed.at(case)
         entry = {
@@ -225,14 +249,22 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) ->
             "solids": [solid | {"movable": movable.get(solid["name"])} for solid in model.solids(case)],
             "recording": None,
         }  # fmt: skip
-        if case in model.simulated and len(header["recordings"]) < sizes.runs:
+        if case in stored:
             entry["recording"] = f"full{index}"
-            recording, planes = _recorded(model, case, header["quantities"], sizes)
+            recording, planes = _recorded(model, case, header["quantities"], sizes, corners)
             header["recordings"][entry["recording"]] = recording
             arrays |= {f"{entry['recording']}.{name}": a for name, a in planes.items()}
         entries.append(entry)
     _check_forcing(model)
     return entries
+
+
+def _surest(model: LiveModel) -> int:
+    """The number of the held-out case of the least error bound, with which a page begins."""
+    files = (model.run.file(rollout_file(index)) for index in range(len(model.pipeline.held_out)))
+    verdicts = [Rollout.open(file).verdict for file in files]
+    bounds = [np.inf if verdict.beyond else verdict.bound_share for verdict in verdicts]
+    return int(np.argmin(np.nan_to_num(bounds, nan=np.inf)))
 
 
 def _movable(model: LiveModel) -> dict[str, dict]:
@@ -275,11 +307,12 @@ def _check_forcing(model: LiveModel) -> None:
 
 
 def _recorded(
-    model: LiveModel, case: Case, quantities: dict, sizes: Sizes
+    model: LiveModel, case: Case, quantities: dict, sizes: Sizes, corners: np.ndarray | None
 ) -> tuple[dict, dict[str, np.ndarray]]:
-    """The full-order run of a case at some of the points that are shown."""
+    """The full-order run of a case at some of the points: at the corners of a surface if they are few."""
     most = min(sizes.points, len(model.shown))
     chosen = np.sort(np.random.default_rng(1).permutation(len(model.shown))[:most])
+    chosen = corners if corners is not None and len(corners) <= sizes.points else chosen
     particles = model.shown[chosen]
     with Trajectory.of(model.truth_run(case)) as trajectory:
         frames = spaced(trajectory.frames, sizes.frames + 1)

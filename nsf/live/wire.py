@@ -8,6 +8,8 @@ from nsf.live import page
 from nsf.live.model import LiveModel
 
 FIELDS = ("basis",)  # the fields of linear modes
+_RADIUS = 0.7  # of a point, over the edge of the cube that it fills: neighbours touch
+_WITHIN = (0.5, 99.5)  # [%] percentiles of places in training, about which the camera stands
 
 
 def field_message(model: LiveModel) -> bytes:
@@ -29,16 +31,16 @@ def field_message(model: LiveModel) -> bytes:
 
 def shown(model: LiveModel) -> dict:
     """The part of the header that every page of a model has."""
-    x, _ = model.training_frames
+    lower, upper = np.percentile(model.training_frames[0], _WITHIN, axis=(0, 1))
     moved = model.tops["displacement"]
     return {
         "title": model.title,
         "run": model.run.id,
         "points": len(model.X),
         "particles": model.particles,
-        "radius": 0.62 * model.spacing,
-        "lower": x.min((0, 1)).tolist(),
-        "upper": x.max((0, 1)).tolist(),
+        "radius": _RADIUS * model.spacing,
+        "lower": lower.tolist(),
+        "upper": upper.tolist(),
         "floor": model.floor,
         "colors": page.colors(),
         "quantities": {"displacement": {"title": "displacement", "unit": "m", "top": moved}},

@@ -7,7 +7,7 @@
 
 const MOST_CELLS = 1 << 20;
 const CELL = 1.6; // edge over the radius of a point; at larger ones holes are seen in a body
-const SLANT = [0.28, 0.175]; // of shadows, over their height
+export const SLANT = [0.28, 0.175]; // of shadows, over their height
 
 /** A body of points. */
 export class Body {
@@ -24,6 +24,7 @@ export class Body {
     this.radius = radius;
     this.offset = offset;
     this.visible = true;
+    /** @type {import("./surface.mjs").Surface | null} drawn in place of points, unless cut open */ this.surface = null;
     /** @type {Numbers} */ this.x = rest;
     /** @type {Shade} */ this.shade = (rows) => new Float32Array(rows.length);
     this._rows = new Uint32Array(this.count);

@@ -2,6 +2,7 @@
 
 const AZIMUTH = -1.08; // [rad] at first
 const GAP = 1.1; // from a body to the one beside it, over the width of the scene
+const FILLED = [0.92, 0.84]; // of the picture's width and height, by the scene
 const TURN = 0.008; // [rad] a pixel
 const KEY_TURN = 0.1; // [rad] a key
 const dot = (/** @type {number[]} */ a, /** @type {number[]} */ b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -20,6 +21,7 @@ export class Camera {
     this.changed = changed;
     this.zoom = 1.9;
     this.azimuth = this.elevation = this.distance = 0;
+    this.fits = true; // until someone comes nearer, or moves aside
     this.centre = [0, 0, 0];
     this.reset();
   }
@@ -28,7 +30,8 @@ export class Camera {
   reset() {
     this.azimuth = AZIMUTH;
     this.elevation = 0.3;
-    this.distance = 1.05 * this.size;
+    this.distance = 1.05 * this.size; // until it is drawn
+    this.fits = true;
     this.centre = this.lower.map((v, c) => 0.5 * (v + this.upper[c]));
     this.changed();
   }
@@ -59,6 +62,7 @@ export class Camera {
    */
   view(aspect) {
     const { right, up, toward } = this.axes;
+    if (this.fits) this.distance = this._fitting(aspect);
     const eye = this.centre.map((c, k) => c + this.distance * toward[k]);
     const near = 0.02 * this.size, far = this.distance + 8 * this.size;
     const f = this.zoom * Math.min(1, aspect), depth = (far + near) / (near - far);
@@ -69,6 +73,14 @@ export class Camera {
     });
     rows[2][3] += (2 * far * near) / (near - far);
     return new Float32Array([0, 1, 2, 3].flatMap((column) => rows.map((row) => row[column])));
+  }
+
+  /** Distance [m] at which the whole scene fills the picture. @param {number} aspect width over height */
+  _fitting(aspect) {
+    const { right, up, toward } = this.axes, f = this.zoom * Math.min(1, aspect);
+    const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((k) => this.centre.map((v, c) => ((k >> c) & 1 ? this.upper : this.lower)[c] - v));
+    return Math.max(0.2 * this.size, ...corners.map((at) => dot(toward, at)
+      + f * Math.max(Math.abs(dot(right, at)) / (aspect * FILLED[0]), Math.abs(dot(up, at)) / FILLED[1])));
   }
 
   /**
@@ -92,6 +104,7 @@ export class Camera {
 
   /** @param {number} factor of the distance */
   approach(factor) {
+    this.fits = false;
     this.distance = Math.max(0.2 * this.size, Math.min(8 * this.size, this.distance * factor));
     this.changed();
   }
@@ -103,6 +116,7 @@ export class Camera {
    */
   move(dx, dy, tall) {
     const { right, up } = this.axes, metres = this.distance / tall;
+    this.fits = false;
     this.centre = this.centre.map((c, k) => c - metres * (dx * right[k] - dy * up[k]));
     this.changed();
   }

@@ -5,6 +5,9 @@ import { quantity } from "./trust.mjs";
 /** @typedef {{ title: string, unit: string, top: number, low?: number, names?: string[] }} Quantity names: of categories, in place of a scale */
 /** @typedef {{ name: string, unit: string, lower: number, upper: number, step: number, trained: number[] }} Parameter */
 
+const PREFIXES = /** @type {[number, string][]} */ ([[1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "µ"]]);
+const LABELS = 5; // below a scale of colours
+
 /**
  * The element with an id, which the page has.
  * @param {string} id
@@ -119,9 +122,14 @@ export function valued(value, unit, step) {
  * @param {string} unit
  */
 export function prefixed(value, unit) {
-  const known = /** @type {[number, string][]} */ ([[1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "µ"]]);
-  const [factor, prefix] = known.find(([own]) => value >= 0.3 * own) ?? known[4];
+  const { factor, prefix } = prefixOf(value);
   return `${Number((value / factor).toPrecision(3))} ${prefix}${unit}`;
+}
+
+/** The prefix in which a value is no less than 0.3, and its factor. @param {number} value */
+function prefixOf(value) {
+  const [factor, prefix] = PREFIXES.find(([own]) => value >= 0.3 * own) ?? PREFIXES[PREFIXES.length - 1];
+  return { factor, prefix };
 }
 
 /** How many points are shown. @param {number} points @param {number} particles of the model */
@@ -139,9 +147,11 @@ export function legend({ title, unit, top, low = 0, names }, colors) {
   const stops = Array.from({ length: 16 }, (_, k) => `rgb(${colors.slice(51 * k, 51 * k + 3)})`);
   const bar = element("i");
   bar.style.background = `linear-gradient(to right, ${stops})`;
-  const ends = names ? element("div", { className: "row" }, ...names.map((name) => element("span", {}, name)))
-    : element("div", { className: "row" }, element("span", {}, low ? `≤ −${prefixed(-low, unit)}` : "0"), element("span", {}, `≥ ${prefixed(top, unit)}`));
-  find("scale").replaceChildren(element("div", { textContent: title }), bar, ends);
+  const { factor, prefix } = prefixOf(top), digits = Math.max(0, 1 - Math.floor(Math.log10(top / factor)));
+  const values = Array.from({ length: LABELS }, (_, k) => ((low + (k * (top - low)) / (LABELS - 1)) / factor).toFixed(digits));
+  const ends = [low ? `≤ ${values[0]}` : "0", ...values.slice(1, -1), `≥ ${values[LABELS - 1]}`].map((text) => text.replace("-", "−"));
+  const labels = element("div", { className: "row" }, ...(names ?? ends).map((text) => element("span", {}, text)));
+  find("scale").replaceChildren(element("div", { textContent: names ? title : `${title} [${prefix}${unit}]` }), bar, labels);
 }
 
 /**

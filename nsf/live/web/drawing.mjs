@@ -1,6 +1,6 @@
 // Points, their shadows, the floor and solids, in WebGL 2.
 
-import { Body } from "./body.mjs";
+import { Body, SLANT } from "./body.mjs";
 import { placed, acts } from "./solids.mjs";
 
 /** @typedef {import("./camera.mjs").Camera} Camera */
@@ -38,6 +38,21 @@ void main() {
   float light = 0.70 + 0.34 * max(0.0, dot(normal, normalize(vec3(-0.45, 0.65, 0.62))));
   pixel = vec4(light * color, 1.0);
 }`,
+];
+const SURFACE = [
+  `#version 300 es
+in vec3 x, normal; in float value; uniform mat4 view; uniform vec3 sun, dark; uniform vec2 slant; uniform float ground;
+uniform bool shadow; uniform sampler2D colors; out vec3 color;
+void main() {
+  vec3 at = shadow ? vec3(x.xy + slant * (x.z - ground), ground) : x;
+  vec3 scaled = textureLod(colors, vec2(clamp(value, 0.0, 1.0) * 0.996 + 0.002, 0.5), 0.0).rgb;
+  color = shadow ? dark : (0.6 + 0.42 * max(0.0, dot(normal, sun))) * mix(scaled, vec3(1.0), 0.06);
+  gl_Position = view * vec4(at, 1.0);
+}`,
+  `#version 300 es
+precision mediump float;
+in vec3 color; out vec4 pixel;
+void main() { pixel = vec4(color, 1.0); }`,
 ];
 const FLOOR = [
   `#version 300 es
@@ -136,6 +151,7 @@ export class Drawing {
     this.gl = gl;
     this.canvas = canvas;
     this.camera = camera;
+    this.scene = { lower: camera.lower, upper: camera.upper }; // without a body beside it
     this.floor = told.floor;
     this.radius = told.radius;
     this.cut = false;
@@ -144,9 +160,11 @@ export class Drawing {
     /** @type {Solid[]} */ this.solids = [];
     /** @type {Body[]} */ this.bodies = [];
     this.points = program(gl, POINTS);
+    this.surface = program(gl, SURFACE);
     this.plane = program(gl, FLOOR);
     this.solid = program(gl, SOLID);
     this.drawn = gl.createBuffer();
+    this.faces = gl.createBuffer();
     this.corners = this._buffer(new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]));
     this.shapes = { box: this._shape(box()), ball: this._shape(ball()) };
     this.scale = gl.createTexture();
@@ -206,9 +224,6 @@ export class Drawing {
     const { gl, points, camera, canvas, floor } = this;
     const middle = camera.lower.map((v, c) => 0.5 * (v + camera.upper[c]));
     /** @type {Cut | null} */ const cut = this.cut ? { x: middle, across: [0.47, -0.88] } : null;
-    points.use();
-    gl.uniformMatrix4fv(points.uniform("view"), false, matrix);
-    gl.uniform3fv(points.uniform("dark"), dark);
     const draw = (/** @type {number} */ radius, /** @type {Float32Array} */ drawn) => {
       gl.uniform1f(points.uniform("pixels"), 2 * pixels * radius);
       gl.bindBuffer(gl.ARRAY_BUFFER, this.drawn);
@@ -216,7 +231,11 @@ export class Drawing {
       this._attribute(points, "point", this.drawn, 4);
       gl.drawArrays(gl.POINTS, 0, drawn.length / 4);
     };
-    const bodies = this.bodies.filter((own) => own.visible);
+    const visible = this.bodies.filter((own) => own.visible), bodies = visible.filter((own) => cut || !own.surface);
+    this._surfaces(visible.filter((own) => !bodies.includes(own)), matrix, dark);
+    points.use();
+    gl.uniformMatrix4fv(points.uniform("view"), false, matrix);
+    gl.uniform3fv(points.uniform("dark"), dark);
     if (floor !== null && this.level === 0) {
       gl.uniform1i(points.uniform("shadow"), 1);
       gl.depthMask(false);
@@ -227,6 +246,31 @@ export class Drawing {
     for (const body of bodies) {
       gl.uniform4fv(points.uniform("tint"), body.tint ? [...body.tint, 1] : [0, 0, 0, 0]);
       draw(body.radius, body.seen(matrix, canvas.width, canvas.height, pixels, cut));
+    }
+  }
+
+  /** @param {Body[]} bodies that have a surface @param {Float32Array} matrix @param {number[]} dark */
+  _surfaces(bodies, matrix, dark) {
+    const { gl, surface, camera, floor } = this, { right, up, toward } = camera.axes;
+    surface.use();
+    gl.uniformMatrix4fv(surface.uniform("view"), false, matrix);
+    gl.uniform3fv(surface.uniform("dark"), dark);
+    gl.uniform3fv(surface.uniform("sun"), unit([0, 1, 2].map((c) => -0.45 * right[c] + 0.65 * up[c] + 0.62 * toward[c])));
+    gl.uniform2fv(surface.uniform("slant"), SLANT);
+    gl.uniform1f(surface.uniform("ground"), floor ?? 0);
+    for (const body of bodies) {
+      const { faces } = /** @type {import("./surface.mjs").Surface} */ (body.surface);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.faces);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STREAM_DRAW);
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.drawn);
+      gl.bufferData(gl.ARRAY_BUFFER, /** @type {any} */ (body.surface).corners(body), gl.STREAM_DRAW);
+      for (const [name, components, at] of /** @type {[string, number, number][]} */ ([["x", 3, 0], ["normal", 3, 12], ["value", 1, 24]]))
+        this._attribute(surface, name, this.drawn, components, 28, at);
+      for (const shadow of floor !== null && this.level === 0 ? [1, 0] : [0]) {
+        gl.uniform1i(surface.uniform("shadow"), shadow);
+        gl.depthMask(!shadow);
+        gl.drawElements(gl.TRIANGLES, faces.length, gl.UNSIGNED_SHORT, 0);
+      }
     }
   }
 
@@ -245,8 +289,8 @@ export class Drawing {
       if (solid.shape === "half-space") {
         // A floor is drawn as such; a wall is a thin plate.
         if (solid.extents[2] > 0.99) continue;
-        wall(pose, solid.extents, camera);
-        extents = [0.25 * camera.size, 0.25 * camera.size, 1e-3 * camera.size];
+        extents = wall(pose, solid.extents, camera.axes.toward, this.scene);
+        if (!extents.length) continue;
       }
       const round = solid.shape === "sphere", shape = round ? this.shapes.ball : this.shapes.box;
       if (round) extents = [0, 1, 2].map(() => solid.extents[0]);
@@ -312,18 +356,23 @@ export class Drawing {
 }
 
 /**
- * Turn a wall's pose so that its third axis is its normal, and put it beside the scene's middle.
+ * Turn a wall's pose so that its third axis is its normal, and put it beside the scene's middle; gives its half edges,
+ * along the scene, or none where it stands before the scene.
  * @param {Float32Array} pose [16] by columns, changed in place
  * @param {number[]} normal
- * @param {Camera} camera
+ * @param {number[]} toward the viewer
+ * @param {{ lower: number[], upper: number[] }} scene corners [m]
  */
-function wall(pose, normal, camera) {
-  const middle = camera.lower.map((v, c) => 0.5 * (v + camera.upper[c]));
+function wall(pose, normal, toward, { lower, upper }) {
+  if (normal.reduce((sum, v, c) => sum + v * toward[c], 0) < 0.05) return [];
+  const middle = lower.map((v, c) => 0.5 * (v + upper[c]));
   const off = normal.reduce((sum, v, c) => sum + v * (middle[c] - pose[12 + c]), 0);
   const flat = Math.abs(normal[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0];
   const one = unit(cross(flat, normal)), two = cross(normal, one);
   [one, two, normal].forEach((axis, j) => axis.forEach((v, c) => { pose[4 * j + c] = v; }));
   middle.forEach((v, c) => { pose[12 + c] = v - off * normal[c]; });
+  const reach = (/** @type {number[]} */ axis) => 0.55 * axis.reduce((sum, v, c) => sum + Math.abs(v) * (upper[c] - lower[c]), 0);
+  return [reach(one), reach(two), 1e-3 * reach(one)];
 }
 
 /** @param {number[]} a @param {number[]} b */

@@ -5,6 +5,7 @@ import { Recording } from "./data.mjs";
 import { Field, displacement, vonMises } from "./field.mjs";
 import { Recurrence, Run } from "./recurrence.mjs";
 import { along, moved } from "./solids.mjs";
+import { Surface } from "./surface.mjs";
 import { Tilt } from "./tilt.mjs";
 import { Trust } from "./trust.mjs";
 
@@ -18,6 +19,7 @@ export class Live {
   constructor(packed) {
     const { header: told, arrays } = packed;
     this.told = told;
+    this.arrays = arrays;
     this.rest = arrays.rest;
     this.deformation = new Field(packed, "deformation");
     this.stress = told.fields.stress ? new Field(packed, "stress") : null;
@@ -26,8 +28,8 @@ export class Live {
     this.recordings = new Map(Object.keys(told.recordings).map((name) => [name, new Recording(packed, name)]));
     this.run = new Run(new Recurrence(packed), told.start, told.dt, MOST);
     this.cursor = 0; // of steps, with its fraction
-    this.case = told.cases[0];
-    this.take(0);
+    this.case = told.cases[told.first];
+    this.take(told.first);
   }
 
   /** The last step: that of the scene, or without end once a hand has tilted the run. */
@@ -217,10 +219,16 @@ export class LivePlayer extends Live {
   place(drawing) {
     const { told } = this;
     this.drawing = drawing;
+    const { corners, faces } = this.arrays, surface = faces ? new Surface(corners, faces) : null;
     this.body = drawing.body(this.rest);
+    this.body.surface = surface;
     this.beside = drawing.camera.beside();
-    for (const [name, own] of this.recordings)
-      this.truths.set(name, drawing.body(own.rest, this.beside, told.radius * Math.cbrt(told.points / own.points)));
+    for (const [name, own] of this.recordings) {
+      const outer = surface && own.points === corners.length;
+      const body = drawing.body(own.rest, this.beside, outer ? told.radius : told.radius * Math.cbrt(told.points / own.points));
+      body.surface = outer ? new Surface(corners.map((_, row) => row), faces) : null;
+      this.truths.set(name, body);
+    }
   }
 
   /** @param {import("./page.mjs").Page} page */
@@ -252,11 +260,11 @@ export class LivePlayer extends Live {
     };
     const keep = () => download(`${told.file}.csv`, new Blob([this.table()], { type: "text/csv" }));
     return [
+      ...(this.pad ? [this.pad.made] : []),
       ...this.sliders.map((own) => own.made),
       choice("from", "moved sliders act", [["start", "from t = 0"], ["here", "from now on"]], "start", () => {}),
-      ...(this.pad ? [this.pad.made] : []),
       ...this.handles.map(({ own }) => own.made),
-      choice("case", "held-out case", cases, "0", take),
+      choice("case", "held-out case", cases, String(told.first), take),
       ...(this.recordings.size ? [element("div", {}, truth, element("small", { id: "sides" }))] : []),
       element("div", { className: "bar" }, button("picture", "Keep picture", picture), button("table", "Keep latent trajectory", keep)),
     ];

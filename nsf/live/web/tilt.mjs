@@ -123,7 +123,7 @@ export class Tilt {
   }
 
   _say() {
-    this.dot.style.transform = `translate(${66 * this.x}px, ${-66 * this.y}px)`;
+    Object.assign(this.dot.style, { left: `${50 + 50 * this.x}%`, top: `${50 - 50 * this.y}%` });
     const degrees = [this.x, this.y].map((v) => Math.round((180 * this.rim * v) / Math.PI));
     this.pad.ariaLabel = `gravity, tilted by ${degrees[0]}° to the right and ${degrees[1]}° away; arrow keys tilt it`;
   }

@@ -148,13 +148,13 @@ export class Trust {
     const { validated, reach } = this.told;
     if (!validated.length || !reach.box.length) return 1;
     const sides = validated.map((/** @type {number[]} */ own) =>
-      Math.max(0, ...reach.box.map(([low, high], /** @type {number} */ i) => (high > low ? Math.abs(own[i] - parameters[i]) / (high - low) : 0))));
+      Math.max(0, ...reach.box.map((/** @type {number[]} */ [low, high], /** @type {number} */ i) => (high > low ? Math.abs(own[i] - parameters[i]) / (high - low) : 0))));
     return 1 + AWAY * Math.min(...sides);
   }
 
   /** Latent vector in metres. @param {Vector} xhat @returns {number[]} */
   _metres(xhat) {
     const { metric } = this.told;
-    return metric.map((_, /** @type {number} */ j) => metric.reduce((/** @type {number} */ sum, /** @type {number[]} */ row, /** @type {number} */ i) => sum + xhat[i] * row[j], 0));
+    return metric.map((/** @type {unknown} */ _, /** @type {number} */ j) => metric.reduce((/** @type {number} */ sum, /** @type {number[]} */ row, /** @type {number} */ i) => sum + xhat[i] * row[j], 0));
   }
 }

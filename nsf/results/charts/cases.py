@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 from nsf.data.case import PROGRAM, Case
 from nsf.errors import ConfigError
-from nsf.results.charts.drawing import ERROR, line, styles, whole_mean
+from nsf.results.charts.drawing import ERROR, base, line, styles, whole_mean
 from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import axis, number
 from nsf.results.style import (
@@ -51,7 +51,7 @@ def error_over_parameters(view: View) -> Figures:
     planes = [(body, part, name) for body, part, names in _several(view) for name in names]
     if not planes:
         return {}
-    drawn = styles(view.frame.assign(variant=_base(view.frame)), "variant")
+    drawn = styles(view.frame.assign(variant=view.frame["variant"].map(base)), "variant")
     fig, each = panels(len(planes), 3.0, 3)
     for panel, (body, part, name) in zip(each, planes, strict=True):
         lost = 0  # rows of crosses
@@ -81,9 +81,7 @@ def error_map(view: View) -> Figures:
 def _maps(view: View, planes: list) -> Figure:
     rows = []
     for body, part, names in planes:
-        ranked = sorted(
-            part.groupby("variant", sort=False), key=lambda one: _rank(one[1]["error"][~one[1]["beyond"]])
-        )
+        ranked = sorted(part.groupby("variant", sort=False), key=lambda one: _rank(_within(one[1])))
         rows += [(body, names, ranked[i : i + _MAPS]) for i in range(0, len(ranked), _MAPS)]
     columns = max(len(ranked) for *_, ranked in rows)
     scale = _colors(100 * pd.concat([part["error"] for _, part, _ in planes]))
@@ -116,7 +114,7 @@ def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
     whether a run diverged or is off by more than `LOST`, `beyond` whether it led beyond what was taught.
     """
     shown = view.frame[view.frame["fallback_share"].fillna(0) == 0]
-    shown = shown.assign(beyond=shown["variant"].str.endswith(BEYOND), variant=_base(shown))
+    shown = shown.assign(beyond=shown["variant"].str.endswith(BEYOND), variant=shown["variant"].map(base))
     for body, part in shown.groupby("body", sort=False):
         try:
             cases = {text: Case.read(text) for text in part["case"].unique()}
@@ -129,11 +127,6 @@ def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
         rows = errors.agg(whole_mean).rename("error").reset_index().dropna(subset="error")
         rows["lost"] = ~(100 * rows["error"] <= LOST)
         yield body, rows.assign(**{n: [cases[text][n] for text in rows["case"]] for n in names}), names
-
-
-def _base(frame: pd.DataFrame) -> pd.Series:
-    """Variants without the note on what led beyond what was taught."""
-    return frame["variant"].str.removesuffix(BEYOND)
 
 
 def _crosses(panel, at: pd.Series, color: str, row: int) -> bool:

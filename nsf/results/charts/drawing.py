@@ -28,10 +28,10 @@ def styles(frame: pd.DataFrame, by: str) -> dict[str, dict]:
     drawn = {}
     for model in dict.fromkeys(model_of.values()):
         names = [name for name in model_of if model_of[name] == model]
-        shades = list(dict.fromkeys(map(_base, names)))
+        shades = list(dict.fromkeys(map(base, names)))
         for k, name in enumerate(names):
             drawn[name] = {
-                "color": model_color(model, shades.index(_base(name)), len(shades)),
+                "color": model_color(model, shades.index(base(name)), len(shades)),
                 "linestyle": DASHES[k % len(DASHES)],
                 "marker": _MARKERS[k % len(_MARKERS)],
                 "label": name,
@@ -39,7 +39,7 @@ def styles(frame: pd.DataFrame, by: str) -> dict[str, dict]:
     return drawn
 
 
-def _base(variant: str) -> str:
+def base(variant: str) -> str:
     """A variant without what is said of some of its rows."""
     return variant.removesuffix(BEYOND).removesuffix(TAKEN)
 

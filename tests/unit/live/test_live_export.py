@@ -21,6 +21,7 @@ from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError
 from nsf.live import demo, publish
 from nsf.live.model import LiveModel, at_surface
+from nsf.live.surface import surface
 from nsf.storage import write_text
 
 WEB = Path(__file__).parents[1] / "web"
@@ -133,20 +134,44 @@ def test_a_model_is_there_at_once(capsys, tmp_path, monkeypatch):
         assert demo.MODELS[model] in path.read_text()
     assert asked == [(tmp_path / f"{model}.html").as_uri() for model in demo.MODELS]
     with pytest.raises(
-        ConfigError, match="model=cake is none that is shipped; choose one of block, sand, metal"
+        ConfigError, match="model=cake is none that is shipped; choose one of block, tray, metal"
     ):
         demo.show("cake", tmp_path)
     with pytest.raises(SystemExit) as end:
-        main(["demo", "model=sand", f"folder={tmp_path}", "open=false"])
+        main(["demo", "model=tray", f"folder={tmp_path}", "open=false"])
     assert not end.value.code
-    assert capsys.readouterr().out == f"open {tmp_path / 'sand.html'}\n"
+    assert capsys.readouterr().out == f"open {tmp_path / 'tray.html'}\n"
     assert len(asked) == len(demo.MODELS)
 
 
 def test_a_model_that_is_shipped_is_small():
     found = [path.stat().st_size for path in Path(demo.__file__).with_name("models").iterdir()]
     assert len(found) == len(demo.MODELS)
-    assert sum(found) < 3e6
+    assert sum(found) < 9e6
+
+
+def test_a_shipped_model_begins_with_a_case_that_is_believed():
+    for model in demo.MODELS:
+        data = Path(demo.__file__).with_name("models") / f"{model}.bin"
+        header, arrays = unpacked(zlib.decompress(data.read_bytes()))
+        assert header["trust"]["calibration"] is not None
+        assert header["cases"][header["first"]]["recording"] is not None
+        assert ("faces" in arrays) == (model != "tray")  # sand is grains
+
+
+def test_a_surface_closes_a_body_and_faces_outward():
+    generator = np.random.default_rng(0)
+    X = generator.random((2000, 3))
+    still = np.stack([X, 1.5 * X])
+    rows, faces = surface(X, 2000 ** (-1 / 3), still)
+    corners = X[rows][faces]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    assert set(np.unique(edges, axis=0, return_counts=True)[1]) <= {2, 4}
+    volume = np.linalg.det(corners).sum() / 6
+    assert 0.75 < volume < 1.0
+    torn = still[1] + (X[:, :1] > 0.5) * np.array([2.0, 0.0, 0.0])
+    assert surface(X, 2000 ** (-1 / 3), np.stack([X, torn])) is None
+    assert surface(X[:4], 1.0, still[:, :4]) is None
 
 
 def test_a_page_is_asked_for_as_other_formats_are(taught_model, tmp_path, capsys, monkeypatch):
@@ -315,7 +340,8 @@ def test_the_full_order_run_stands_beside(opened, page):
     wait_until(lambda: tab.locator("#canvas").screenshot() != before)
     shown = "nsf.player.recordings.get(nsf.player.case.recording)"
     full = np.reshape(tab.evaluate(f"Array.from({shown}.at({shown}.frameAt(0.12)).x)"), (-1, 3))
-    assert np.abs(full - positions(tab)).max() < 0.02
+    corners = tab.evaluate("Array.from(nsf.player.arrays.corners)")
+    assert np.abs(full - positions(tab)[corners]).max() < 0.02
     tab.get_by_label("friction angle").fill("31")
     tab.get_by_text("No full-order run of this was stored").wait_for()
 
@@ -333,6 +359,24 @@ def test_what_it_keeps_is_the_picture_and_the_run(opened, page):
     with tab.expect_download() as kept:
         tab.click("#picture")
     assert Path(kept.value.path()).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height"), [(800, 480), (390, 844), (1280, 800)])
+def test_the_pad_is_in_sight_and_the_scene_within_the_picture(opened, tilting_page, width, height):
+    tab = opened(tilting_page, width, height)
+    box = tab.locator("#pad").bounding_box()
+    assert box["y"] >= 0
+    assert box["y"] + box["height"] <= height
+    assert tab.locator("#scale span").count() >= 4
+    corners = """() => { const { camera, drawing: { canvas } } = nsf, { lower, upper } = camera;
+        const m = camera.view(canvas.width / canvas.height);
+        return [0, 1, 2, 3, 4, 5, 6, 7].flatMap((k) => {
+            const x = [0, 1, 2].map((c) => ((k >> c) & 1 ? upper : lower)[c]);
+            const row = (r) => m[r] * x[0] + m[4 + r] * x[1] + m[8 + r] * x[2] + m[12 + r];
+            return [row(0) / row(3), row(1) / row(3)]; }); }"""
+    reach = np.abs(tab.evaluate(corners)).max()
+    assert 0.8 < reach < 1.0
 
 
 def test_on_a_phone_in_the_dark(opened, page):

@@ -11,6 +11,7 @@ import { Pace } from "../../../nsf/live/web/drawing.mjs";
 import { Field, Network, displacement, vonMises } from "../../../nsf/live/web/field.mjs";
 import { Recurrence, Run } from "../../../nsf/live/web/recurrence.mjs";
 import { acts, along, moved, placed, poseAt, stateOf, valueAt } from "../../../nsf/live/web/solids.mjs";
+import { Surface } from "../../../nsf/live/web/surface.mjs";
 import { tilted } from "../../../nsf/live/web/tilt.mjs";
 import { Trust, lightOf, quantity } from "../../../nsf/live/web/trust.mjs";
 
@@ -269,6 +270,27 @@ test("numbers as text", () => {
 const lattice = () => Float32Array.from({ length: 3 * 20 ** 3 }, (_, i) => {
   const p = Math.floor(i / 3);
   return 1e-3 * [p % 20, Math.floor(p / 20) % 20, Math.floor(p / 400)][i % 3];
+});
+
+test("a surface keeps its size, loses its roughness and faces outward", () => {
+  // A rough ball of rings, whose corners are all points of a body but the first.
+  const [rings, around] = [14, 20], at = (i, j) => 1 + (i - 1) * around + (j % around), places = [[9, 9, 9]], faces = [];
+  for (let i = 1; i < rings; i++)
+    for (let j = 0; j < around; j++) {
+      const [a, b, size] = [(Math.PI * i) / rings, (2 * Math.PI * j) / around, 1 + 0.05 * ((i + j) % 2)];
+      places.push([Math.sin(a) * Math.cos(b), Math.sin(a) * Math.sin(b), Math.cos(a)].map((v) => size * v));
+      if (i < rings - 1) faces.push(at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j), at(i + 1, j + 1), at(i, j + 1));
+    }
+  const x = Float32Array.from(places.flat()), rows = places.map((_, p) => p).slice(1);
+  const surface = new Surface(rows, faces.map((p) => p - 1)), body = new Body(x, 0.1, [10, 0, 0]);
+  body.show(x, (of) => of);
+  const drawn = surface.corners(body);
+  for (let i = 4; i < rings - 4; i++) {
+    const to = 7 * (at(i, 3) - 1), out = [drawn[to] - 10, drawn[to + 1], drawn[to + 2]], radius = Math.hypot(...out);
+    assert.ok(Math.abs(radius - 1.025) < 0.02, `${radius}`);
+    assert.ok(out.reduce((sum, v, c) => sum + v * drawn[to + 3 + c], 0) > 0.98 * radius);
+    assert.equal(drawn[to + 6], at(i, 3));
+  }
 });
 
 test("points are left out that others hide, and no other", () => {
