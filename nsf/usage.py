@@ -108,6 +108,7 @@ records:
   runs          list, compare, verify, delete runs
   index         a page of all runs
   reports       a page of all reports
+  validate      full-order runs beside published answers
   bench         time and memory of a step
   doctor        versions, devices, folders"""
 _EXAMPLES = """\
