@@ -177,7 +177,7 @@ def _settings(frame: pd.DataFrame, sources: Mapping[str, Source], folder: Path) 
         settings = [part for _, part in rows.groupby("variant", sort=False)]
         if len(settings) < 2 or rows["model_name"].nunique() > 1:
             continue
-        worst = settings[0].loc[settings[0]["delta"].fillna(math.inf).idxmax(), "case"]
+        worst = settings[0].loc[settings[0]["displacement_error"].fillna(math.inf).idxmax(), "case"]
         chosen = [settings[i] for i in spaced(len(settings), _ROWS)]
         shown = []
         for part in (part[part["case"] == worst].head(1) for part in chosen):
@@ -198,8 +198,8 @@ def _settings(frame: pd.DataFrame, sources: Mapping[str, Source], folder: Path) 
 def cases(
     rows: pd.DataFrame, baseline: pd.DataFrame, sources: Mapping[str, Source], limit: int
 ) -> list[Shown]:
-    """At most `limit` cases of a run, from the worst to the best, which are always among them."""
-    ranked = rows.assign(rank=-rows["delta"].fillna(math.inf)).sort_values("rank", kind="stable")
+    """At most `limit` cases of a run, from the worst in displacement to the best, both among them."""
+    ranked = rows.assign(rank=-rows["displacement_error"].fillna(math.inf)).sort_values("rank", kind="stable")
     chosen = ranked.iloc[spaced(len(ranked), limit)]
     of_baseline = _motions(baseline, chosen["case"], sources)
     shown = []

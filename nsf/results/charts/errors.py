@@ -41,15 +41,16 @@ def programs(view: View) -> Figures:
     if forced.empty:
         return {}
     groups = list(forced.groupby("body", sort=False))
-    counts = [part["variant"].nunique() + len(RIVALS) for _, part in groups]
+    rivals = [[name for name in RIVALS if part[name].notna().any()] for _, part in groups]
+    counts = [part["variant"].nunique() + len(of) for (_, part), of in zip(groups, rivals, strict=True)]
     fig, drawn = row_panels(counts, 0.32, 0.9)
-    for panel, (body, part) in zip(drawn, groups, strict=True):
+    for panel, (body, part), of in zip(drawn, groups, rivals, strict=True):
         variants_of = list(part.groupby("variant", sort=False))
         rows = [
             (name, _of_programs(one["displacement_error"], one), model_color(one["model_name"].iloc[0]))
             for name, one in variants_of
         ]
-        rows += [(COLUMNS[n].title, _of_programs(part[n], part), RIVAL_COLORS[n]) for n in RIVALS]
+        rows += [(COLUMNS[n].title, _of_programs(part[n], part), RIVAL_COLORS[n]) for n in of]
         error_scale(panel, np.concatenate([errors for _, errors, _ in rows]), "x")
         for y, (_, errors, color) in enumerate(rows):
             _dots(panel, y, errors, color)

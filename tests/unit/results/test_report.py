@@ -1,6 +1,7 @@
 """A report of runs: its page and table, what it refuses, and when it stands as it is."""
 
 import json
+import math
 import re
 
 import numpy as np
@@ -91,6 +92,14 @@ def test_files_and_pictures_have_their_hashes_and_runs(report, runs):
     assert set(content["files"]) == {path.name for path in report.iterdir()} - {"sources.json"}
     assert set(content["runs"]) == {run.id for run in runs}
     assert content["pictures"]["projected-strip.png"]["runs"] == sorted({runs[0].id, runs[2].id})
+
+
+def test_the_worst_case_is_the_worst_in_displacement(runs):
+    source = open_sources(runs[:1])[0]
+    rows = table.labelled(source.rows.assign(run=source.id, setting="", paper_delta=math.nan))
+    rows = rows.assign(displacement_error=[0.3, 0.1])  # δ ranks them the other way round
+    shown = pictures.cases(rows, rows.iloc[:0], {source.id: source}, 2)
+    assert {case.place: case.error for case in shown} == {"worst": 0.3, "best": 0.1}
 
 
 def test_a_report_stands_as_it_is_until_something_changes(runs, report, tmp_path, text_alone):
