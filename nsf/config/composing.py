@@ -1,17 +1,11 @@
-"""Configurations composed from the groups of `conf/`, or read from a file, and checked.
+"""Configurations composed by Hydra from the groups of `conf/`, resolved and checked."""
 
-A problem parameter is the value of one configuration key (`scene.parameters.NAME.key`), so a
-simulation of a case is the same configuration with these keys replaced.
-"""
-
-import difflib
 import os
 import pickle
 import re
 import typing
-import warnings
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -19,41 +13,26 @@ from hydra import compose, version
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, OverrideParseException
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
-from yaml import MarkedYAMLError, YAMLError
+from yaml import YAMLError
 
 from nsf import paths
 from nsf.config import targets
-from nsf.config.documents import check_sizes, text_of
-from nsf.config.removed import refuse_keys, refuse_overrides
-from nsf.config.resolvers import leaves, resolved
+from nsf.config.documents import check_sizes
+from nsf.config.removed import refuse_keys
+from nsf.config.resolvers import resolved
 from nsf.config.schema import refuse_unread
-from nsf.errors import ConfigError, first_line, unknown
+from nsf.errors import ConfigError
 from nsf.paths import REMEDY, files, groups, user_folders
-
-# conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
-warnings.filterwarnings(
-    "ignore", message=r"\s*'hydra/launcher/joblib' is validated against ConfigStore schema"
-)
-
-#: Of Hydra's launchers: no files of Hydra's, and loggers left alone.
-_SWEEP = (
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
-    "hydra.output_subdir=null",
-    "hydra.sweep.dir=${oc.env:NSF_RUNS,runs}/multirun",
-    "hydra.sweep.subdir=.",
-)
 
 _Sizes = tuple[tuple[Path, int, int], ...]  # of files: their times and bytes, by which a change is seen
 #: Raised by Hydra and the yaml parser on files that are no configuration, beside their own errors.
-_OF_BROKEN_FILES = (
+OF_BROKEN_FILES = (
     YAMLError,
     ValueError,
     RecursionError,
@@ -64,73 +43,29 @@ _OF_BROKEN_FILES = (
 )
 
 
-def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConfig:
-    """Compose the configuration from Hydra overrides and check it.
-
-    Interpolations stay, so that a key that is replaced later (the problem parameter) is seen by
-    every key that refers to it.
-
-    Args:
-        overrides: `key=value` in Hydra's grammar, for example `scene=sand`, `scene.dt=0.001`.
-        config_name: the primary file in `conf/`.
-
-    Raises:
-        ConfigError: unknown key or option (with the nearest known one), a missing value,
-            a syntax error, a `_target_` that its key does not expect, an interpolation that is refused,
-            or a key that was removed.
-    """
-    refuse_overrides(overrides)
-    try:
-        return checked(_compose(config_name, overrides))
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(explained(error, config_name, overrides)) from error
-    except MarkedYAMLError as error:
-        mark = error.problem_mark
-        raise ConfigError(f"{mark.name}, line {mark.line + 1}: {error.problem}; correct the yaml") from error
-    except _OF_BROKEN_FILES as error:
-        for path in files():
-            text_of(path)  # tells of the one that cannot be read
-        reason = explained(error, config_name, overrides)
-        culprit = _culprit(config_name, overrides)
-        raise ConfigError(f"the configuration cannot be composed{culprit}: {reason}") from error
-
-
-def _culprit(config_name: str, overrides: Sequence[str]) -> str:
-    """The override of a key without which the rest can be composed, as a part of a message."""
-    for override in (o for o in overrides if "." in o.partition("=")[0]):
-        rest = [o for o in overrides if o != override]
-        with suppress(HydraException, OmegaConfBaseException, ConfigError, *_OF_BROKEN_FILES):
-            if _with_values(config_name, rest, check_sizes(files())):
-                return f" with {override}"
-    return ""
-
-
-def read(path: Path) -> DictConfig:
-    """The configuration of a file that is whole by itself, as a run's; its interpolations stay.
-
-    Raises:
-        ConfigError: the file cannot be read, or holds no configuration; see also `load`.
-    """
-    try:
-        config = OmegaConf.create(text_of(path))
-    except (OmegaConfBaseException, *_OF_BROKEN_FILES) as error:
-        raise ConfigError(f"{path} is no configuration: {first_line(error)}; correct the yaml") from error
-    if not isinstance(config, DictConfig):
-        raise ConfigError(f"{path} is no configuration: it has no keys; correct the yaml")
-    try:
-        return checked(config)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
-
-
-def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+def composed(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    """The configuration that Hydra composes of overrides and files, unchecked; it takes new keys."""
     return pickle.loads(_composed(config_name, tuple(overrides), check_sizes(files())))
 
 
 @lru_cache(maxsize=64)
-def _composed(config_name: str, overrides: tuple[str, ...], sizes: _Sizes) -> bytes:
-    """The configuration that Hydra composes of overrides and files, pickled: jobs ask for the same again."""
-    config = _unlocked(config_name, overrides, sizes)
+def _composed(config_name: str, overrides: tuple[str, ...], _sizes: _Sizes) -> bytes:
+    """The same pickled: jobs ask for the same again."""
+    return pickle.dumps(unlocked(config_name, overrides))
+
+
+def unlocked(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    """The configuration of `composed`, composed anew."""
+    config = with_values(config_name, overrides, check_sizes(files()))
+    if config is None or "hydra" in config:
+        config = _apart(_with_hydra(config_name, overrides))
+    OmegaConf.set_readonly(config, False)
+    OmegaConf.set_struct(config, False)
+    return config
+
+
+def _apart(config: DictConfig) -> DictConfig:
+    """A configuration without Hydra's own part, which must be as it is by default."""
     hydra = _of_hydra(config)
     if hydra != _default_hydra():
         changed = [f"hydra.{key}" for key, value in hydra.items() if value != _default_hydra().get(key)]
@@ -140,15 +75,8 @@ def _composed(config_name: str, overrides: tuple[str, ...], sizes: _Sizes) -> by
             f"the configuration sets {', '.join(changed)}, by which Hydra could be made to run code; "
             "leave it out: only the command line says how jobs are launched"
         )
-    del config["hydra"]
-    return pickle.dumps(config)
-
-
-def _unlocked(config_name: str, overrides: Sequence[str], sizes: _Sizes) -> DictConfig:
-    """The configuration with Hydra's own part, which takes new keys."""
-    config = _with_values(config_name, overrides, sizes) or _with_hydra(config_name, overrides)
-    OmegaConf.set_readonly(config, False)
-    OmegaConf.set_struct(config, False)
+    with open_dict(config), read_write(config):
+        del config["hydra"]
     return config
 
 
@@ -172,8 +100,8 @@ def _with_hydra(config_name: str | None, overrides: Sequence[str]) -> DictConfig
         return compose(config_name, overrides=list(overrides), return_hydra_config=True)
 
 
-def _with_values(config_name: str, overrides: Sequence[str], sizes: _Sizes) -> DictConfig | None:
-    """The result of `_with_hydra` in a quarter of the time: values set on options that many jobs share.
+def with_values(config_name: str, overrides: Sequence[str], sizes: _Sizes) -> DictConfig | None:
+    """As by `_with_hydra` in a quarter of the time: values set on options that many jobs share.
 
     None where Hydra refuses the values, so that it says of all overrides together what is wrong.
 
@@ -184,14 +112,26 @@ def _with_values(config_name: str, overrides: Sequence[str], sizes: _Sizes) -> D
     options = tuple(o for o in overrides if _of_group(o, names))
     config = pickle.loads(_of_groups(config_name, options, sizes))
     try:
-        values = OverridesParser.create().parse_overrides([o for o in overrides if o not in options])
+        values = [_parsed(override) for override in overrides if override not in options]
         if not any(value.is_sweep_override() for value in values):
             ConfigLoaderImpl._apply_overrides_to_config(values, config)
             return config
-    except (HydraException, OmegaConfBaseException, *_OF_BROKEN_FILES) as error:
-        if isinstance(error, HydraException) and _missing_key(error):
+    except (HydraException, OmegaConfBaseException, *OF_BROKEN_FILES) as error:
+        if isinstance(error, HydraException) and missing_key(error):
             raise
     return None
+
+
+def missing_key(error: Exception) -> str | None:
+    """The key of an override that Hydra does not take, as the configuration has none like it."""
+    match = re.search(r"Could not override '([^']+)'", str(error))
+    return match[1] if match else None
+
+
+@lru_cache(maxsize=1024)
+def _parsed(override: str) -> Override:
+    """An override as Hydra reads it: jobs share most of theirs, and each takes a millisecond."""
+    return OverridesParser.create().parse_override(override)
 
 
 def _of_group(override: str, names: Collection[str]) -> bool:
@@ -202,7 +142,7 @@ def _of_group(override: str, names: Collection[str]) -> bool:
 
 @lru_cache(maxsize=64)
 def _of_groups(config_name: str, options: tuple[str, ...], _sizes: _Sizes) -> bytes:
-    return pickle.dumps(_with_hydra(config_name, options))
+    return pickle.dumps(_apart(_with_hydra(config_name, options)))
 
 
 def _of_hydra(config: DictConfig) -> dict[str, typing.Any]:
@@ -223,8 +163,8 @@ def checked(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
-    tree, _ = _checked(config)
-    return pickle.loads(_node(tree))
+    check(config)
+    return pickle.loads(pickle.dumps(config))
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -233,17 +173,29 @@ def resolve(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
-    _, plain = _checked(config)
-    return pickle.loads(_node(plain))
+    return pickle.loads(_node(check(config)))
 
 
-def _checked(config: DictConfig) -> tuple[bytes, bytes]:
-    """The pickled trees of a configuration and of the same resolved, both checked."""
+def check(config: DictConfig) -> bytes:
+    """The pickled tree of a configuration whose interpolations are resolved, once that is checked."""
     try:
-        tree = pickle.dumps(OmegaConf.to_container(config))
-        return tree, _resolved(tree, os.environ.get("NSF_REPORTS"))
+        return _resolved(_Tree(config), os.environ.get("NSF_REPORTS"))
     except RecursionError as error:
         raise ConfigError("the configuration is nested too deeply; flatten it") from error
+
+
+class _Tree:
+    """A configuration that a cache knows by its content."""
+
+    def __init__(self, config: DictConfig):
+        self.config, self.raw = config, OmegaConf.to_container(config)
+        self._content = pickle.dumps(self.raw)
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Tree) and self._content == other._content
 
 
 @lru_cache(maxsize=64)
@@ -253,13 +205,12 @@ def _node(tree: bytes) -> bytes:
 
 
 @lru_cache(maxsize=64)
-def _resolved(tree: bytes, _reports: str | None) -> bytes:
+def _resolved(tree: _Tree, _reports: str | None) -> bytes:
     """A pickled tree resolved and checked: jobs ask for the same again. A value may name NSF_REPORTS."""
-    raw = pickle.loads(tree)
-    plain = resolved(pickle.loads(_node(tree)))
+    plain = resolved(tree.config)
     refuse_keys(plain)
     targets.check(plain)
-    refuse_unread(raw, plain)
+    refuse_unread(tree.raw, plain)
     return pickle.dumps(plain)
 
 
@@ -271,116 +222,3 @@ def of_launcher(override: str) -> bool:
 def names_scene(override: str) -> bool:
     """Whether an override chooses the scene."""
     return override.lstrip("+").startswith(("scene=", "scene@"))
-
-
-def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[DictConfig, ConfigLoader]:
-    """The configuration from which Hydra launches jobs, and what composes each of them.
-
-    Args:
-        overrides: Hydra's own, as `hydra/launcher=slurm`, `hydra.launcher.partition=gpu`.
-        config_name: as for `load`.
-
-    Raises:
-        ConfigError: an unknown key or launcher, with the nearest known one.
-    """
-    with initialized(job_name="nsf"):
-        hydra = GlobalHydra.instance().hydra
-        try:
-            config = hydra.compose_config(
-                config_name, [*_SWEEP, *overrides], RunMode.MULTIRUN, with_log_configuration=False
-            )
-        except HydraException as error:
-            raise ConfigError(explained(error, config_name, overrides)) from error
-        return config, hydra.config_loader
-
-
-def _unparsed(override: str, first: str) -> str:
-    """Why Hydra does not read an override, and how to write it; a shell takes one pair of quotes away."""
-    key, _, value = override.partition("=")
-    if re.fullmatch(r"[+~\w.@/]+", key) and value and not re.search(r"['\"{}\[\]$\\]", value):
-        return f"{override!r} needs quotes of Hydra's inside those of the shell; write '{key}=\"{value}\"'"
-    return f"{override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"
-
-
-def _missing_key(error: Exception) -> str | None:
-    """The key of an override that Hydra does not take, as the configuration has none like it."""
-    match = re.search(r"Could not override '([^']+)'", str(error))
-    return match[1] if match else None
-
-
-def _unknown(key: str, config_name: str, overrides: Sequence[str]) -> str:
-    """The message about a key that no file sets."""
-    others = [o for o in overrides if not o.lstrip("+~").startswith(key)]
-    if of_launcher(key):
-        tree = OmegaConf.to_container(launching(others, config_name)[0])
-        return unknown(key, [".".join(path) for path, _ in leaves(tree)])
-    added = [f"+{o}" if o.startswith(f"{key}=") else o for o in overrides]
-    try:
-        mapping = any(o.startswith(f"{key}={{") for o in overrides)
-        if mapping and OmegaConf.select(_compose(config_name, others), key) is not None:
-            return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
-        config = _unlocked(config_name, added, check_sizes(files()))
-        del config["hydra"]
-        checked(config)
-    except ConfigError as error:
-        return str(error)
-    except HydraException as error:
-        other = _missing_key(error)
-        return first_line(error) if other in (None, key) else _unknown(other, config_name, added)
-    keys = _keys(config_name, others)
-    parents = [key[:at] for at, letter in enumerate(key) if letter == "."]
-    if gone := [parent for parent in parents if parent not in keys]:
-        return unknown(gone[0], keys)
-    return f"no file sets {key!r}; add it with a plus, +{key}=…"
-
-
-def _keys(config_name: str, overrides: Sequence[str]) -> dict[str, None]:
-    """Every dotted key of a composed configuration, also of those that hold others."""
-    tree = OmegaConf.to_container(_compose(config_name, overrides))
-    return {".".join(path[: n + 1]): None for path, _ in leaves(tree) for n in range(len(path))}
-
-
-def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
-    """Hydra's message in one line, with the nearest known key."""
-    text = str(error)
-    first = (text.splitlines() or ["a value cannot be read; check quotes, brackets and ${…}"])[0]
-    if key := _missing_key(error):
-        if key == "experiment":
-            return "an experiment is named with a plus: +experiment=NAME"
-        return _unknown(key, config_name, overrides)
-    if missing := re.search(r"Could not delete from config. '([^']+)' does not exist", text):
-        others = [o for o in overrides if o.lstrip("~").partition("=")[0] != missing[1]]
-        return unknown(missing[1], _keys(config_name, others))
-    if isinstance(error, OverrideParseException):
-        return _unparsed(str(error.override), first)
-    if first.startswith("Could not append to config"):
-        return f"{first.rstrip('.')}; leave out the plus, or quote braces for the shell"
-    if first.startswith("Ambiguous value"):
-        return f"{first}; several values of a key need -m"
-    if "hydra.searchpath" in text:
-        return f"hydra.searchpath is refused; {REMEDY}"
-    if first.startswith("You must specify"):
-        gone = [o for o in overrides if o.startswith("~") and o[1:].partition("=")[0] in groups()]
-        return f"{gone[0]} leaves nothing in its place; choose an option" if gone else first
-    if "raised while composing config" in first:
-        return f"{first} {text.splitlines()[1]}; a file of a group maps keys to values"
-    nameless = [o for o in overrides if o.startswith("=")]
-    if nameless:
-        return f"{nameless[0]!r} has no key; give key=value"
-    if "Config group override must be" in first:
-        pairs = (o.lstrip("+").split("=", 1) for o in overrides if "=" in o)
-        options = [f"{group}={name}" for group, name in pairs if name not in groups().get(group, [name])]
-        if options:
-            return f"{options[0]} names no option of its group; `nsf run --help` lists them"
-    if first.startswith("Error merging override") and error.__cause__ is not None:
-        return f"{first.removeprefix('Error merging override ')}: {str(error.__cause__).splitlines()[0]}"
-    option = re.search(r"Could not find '([^']+)'", text)
-    group = max((g for g in groups() if option and option[1].startswith(f"{g}/")), key=len, default=None)
-    if option and group:
-        name, names = option[1].removeprefix(f"{group}/"), groups()[group]
-        near = difflib.get_close_matches(name, names, n=1)
-        if Path("conf", group, f"{name}.yaml").is_file():
-            return f"unknown {group}={name}; conf has it: add --config-dir conf"
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        return f"unknown {group}={name}; choose one of {', '.join(names)}{hint}"
-    return first

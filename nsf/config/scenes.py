@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from nsf.config.composing import load, resolve
+from nsf.config.composing import resolve
 from nsf.config.keys import naming_the_missing, replaced, section
+from nsf.config.loading import load
 from nsf.config.resolvers import following
 from nsf.config.targets import build, build_all, filled
 from nsf.errors import ConfigError
@@ -38,17 +39,18 @@ def load_scene(name: str, overrides: Sequence[str] = ()) -> Scene:
     return scene_of(load([f"scene={name}", *overrides]))
 
 
-def scene_of(config: DictConfig) -> Scene:
+def scene_of(config: DictConfig, whole: DictConfig | None = None) -> Scene:
     """The scene of a configuration with `scene`, `material` and `transfer`.
 
     Args:
         config: with its interpolations, where it has any.
+        whole: the same resolved, where it is at hand.
 
     Raises:
         ConfigError: a key is unknown, a value refused, or a key refers to one that a parameter replaces.
     """
     with naming_the_missing():
-        whole = resolve(config)
+        whole = resolve(config) if whole is None else whole
         for name, parameter in _parameters(section(whole, "scene.parameters")).items():
             _refuse_followers(config, name, parameter.key)
         scene = _built(whole, build(section(whole, "scene.design"), "scene.design"))

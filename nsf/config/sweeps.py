@@ -11,7 +11,8 @@ from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from nsf.config.composing import explained, initialized, load
+from nsf.config.composing import initialized
+from nsf.config.loading import explained, load
 from nsf.errors import ConfigError
 
 #: Of a sweep; the largest experiment has some hundred.

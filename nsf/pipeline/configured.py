@@ -56,7 +56,7 @@ class Configured:
         self.template = configuration.checked(with_candidates(config))
         c = self.config = configuration.resolve(self.template)
         check_values(c)
-        self.scene = scene_of(self.template)
+        self.scene = scene_of(self.template, c)
         self.split = self.scene.split
         names, count = self.split.names, len(self.split.train)
         if count <= len(names):
