@@ -12,7 +12,7 @@ from torch import Tensor
 from nsf.data import PROGRAM
 from nsf.deployment import TRUST, Trust
 from nsf.errors import ConfigError, ShapeError
-from nsf.inverse.inputs import Polynomial
+from nsf.inverse.model.inputs import Polynomial
 from nsf.inverse.recurrence import differentiable_run, member_runs
 from nsf.kinematics.manifold import Restriction
 from nsf.models import Recurrence

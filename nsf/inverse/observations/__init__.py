@@ -14,8 +14,8 @@ from torch import Tensor
 from nsf.data import Trajectory
 from nsf.errors import ConfigError
 from nsf.evaluation.quantities import QUANTITIES
-from nsf.inverse.columns import COLUMNS, read_columns
 from nsf.inverse.model import Model
+from nsf.inverse.observations.columns import COLUMNS, read_columns
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Restriction
 from nsf.vectors import drawn
