@@ -18,9 +18,9 @@ from nsf.pipeline.outcome import best_text
 from nsf.results.search import OBJECTIVES, write_search
 from nsf.results.table import parsed, read
 from nsf.storage import locked
+from nsf.words import NUMBER
 
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_RANGE = re.compile(rf"(?P<key>[\w./]+)=(?P<low>{_NUMBER})\.\.(?P<high>{_NUMBER})(?P<log>:log)?")
+_RANGE = re.compile(rf"(?P<key>[\w./]+)=(?P<low>{NUMBER})\.\.(?P<high>{NUMBER})(?P<log>:log)?")
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 from nsf.errors import first_line
 from nsf.extras import optional
 from nsf.runs import Run
+from nsf.runs.listing import flat
 from nsf.storage import locked
 
 if TYPE_CHECKING:
@@ -148,18 +149,12 @@ class Tracked:
         self._failed = True
 
     def _keys(self) -> dict[str, Any]:
-        return flat(OmegaConf.to_container(self._pipeline.config, resolve=True))
+        return as_text(flat(OmegaConf.to_container(self._pipeline.config, resolve=True)))
 
 
-def flat(values: Mapping[str, Any], head: str = "") -> dict[str, Any]:
-    """Values of nested mappings by dotted keys; lists as text."""
-    plain: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping) and value:
-            plain |= flat(value, f"{head}{key}.")
-        else:
-            plain[f"{head}{key}"] = value if isinstance(value, bool | int | float | str) else str(value)
-    return plain
+def as_text(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers, truth values and texts as they are, others as text."""
+    return {key: v if isinstance(v, bool | int | float | str) else str(v) for key, v in keys.items()}
 
 
 def figures(pipeline) -> dict[str, float]:

@@ -8,7 +8,8 @@ import pytest
 from nsf.config import load
 from nsf.errors import MissingExtraError, NSFError
 from nsf.pipeline import sweep, tracking
-from nsf.pipeline.tracking import EXTRAS, Tool, figures, flat
+from nsf.pipeline.tracking import EXTRAS, Tool, as_text, figures
+from nsf.runs.listing import flat
 
 
 @pytest.fixture
@@ -151,4 +152,4 @@ def test_tracking_that_is_not_installed(pipeline_at, tmp_path, monkeypatch, kind
 
 
 def test_keys_are_flat():
-    assert flat({"a": {"b": 1, "c": [1, 2]}, "d": None}) == {"a.b": 1, "a.c": "[1, 2]", "d": "None"}
+    assert as_text(flat({"a": {"b": 1, "c": [1, 2]}, "d": None})) == {"a.b": 1, "a.c": "[1, 2]", "d": "None"}

@@ -150,22 +150,15 @@ def _cost_by(cost: dict, by: str) -> dict:
 
 def _costs_in_a_row(cost: dict, factor: int | None) -> dict[str, float]:
     """Columns of `results.csv`, of the coarse run at a factor of Δx; NaN where nothing was measured."""
-
-    full, reduced = cost.get("full_order", {}), cost.get("reduced", {})
-    coarse = cost.get("coarse", {}).get(str(factor), {})
-    return {
-        "step_ms_full": full.get("step_ms", math.nan),
-        "step_ms": reduced.get("step_ms", math.nan),
-        "step_ms_p10": reduced.get("step_ms_p10", math.nan),
-        "step_ms_p90": reduced.get("step_ms_p90", math.nan),
-        "step_ms_coarse": coarse.get("step_ms", math.nan),
-        "total_ms_full": full.get("total_ms", math.nan),
-        "total_ms": reduced.get("total_ms", math.nan),
-        "total_ms_coarse": coarse.get("total_ms", math.nan),
-        "decode_ms": cost.get("decode_ms", math.nan),
-        "memory_full_mib": full.get("memory_mib", math.nan),
-        "memory_mib": reduced.get("memory_mib", math.nan),
+    solvers = {
+        "": cost.get("reduced", {}),
+        "_full": cost.get("full_order", {}),
+        "_coarse": cost.get("coarse", {}).get(str(factor), {}),
     }
+    times = {f"{name}{end}": of.get(name) for end, of in solvers.items() for name in ("step_ms", "total_ms")}
+    times |= {name: solvers[""].get(name) for name in ("step_ms_p10", "step_ms_p90", "memory_mib")}
+    times |= {"memory_full_mib": solvers["_full"].get("memory_mib"), "decode_ms": cost.get("decode_ms")}
+    return {name: math.nan if value is None else value for name, value in times.items()}
 
 
 def _break_even(cost: dict, seconds: float) -> float:
