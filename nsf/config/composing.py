@@ -140,7 +140,7 @@ def _of_group(override: str, names: Collection[str]) -> bool:
     return key in names or "@" in key or "/" in key or of_launcher(override)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _of_groups(config_name: str, options: tuple[str, ...], _sizes: _Sizes) -> bytes:
     return pickle.dumps(_apart(_with_hydra(config_name, options)))
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from nsf import config
+from nsf.config.scenes import config_of, scene_of
 from nsf.mpm.materials import PATHS, deformation_path, drive
 from nsf.mpm.stability import check_time_step
 from nsf.paths import CONF, groups
 from nsf.pipeline import Pipeline
 from nsf.scenes.checks import check_physics
+from nsf.scenes.identity import plain_scene
 from nsf.scenes.resolution import resolution_warnings
 from nsf.validation import PROBLEMS
 
@@ -47,6 +49,7 @@ def test_scene_is_runnable(name, scale):
     """In the cases at the ends of each range: particles in the domain, a stable step, no body in another."""
     scene = Pipeline(config.load([f"scene={name}", f"scale={scale}", "device=cpu"])).check().scene
     assert scene.name == name
+    assert plain_scene(scene_of(config_of(scene))) == plain_scene(scene)
     ends = {end(scene.split.cases, key=itemgetter(of)) for of in scene.varied for end in (min, max)}
     for case in sorted(ends):
         at = scene.at(case)

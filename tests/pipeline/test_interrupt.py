@@ -77,16 +77,6 @@ def test_control_c(nsf, copied, pipeline_at, stage):
     nothing_half_written(root)
 
 
-def test_a_resumed_training_ends_with_the_same_bits(nsf, copied, pipeline_at, chain):
-    """Here in its second phase; tests of trainings have the other moments."""
-    root = copied("simulate")
-    moment = SignalAt("nsf.kinematics.training.lightning:FieldTraining._step", 260)
-    assert nsf("train", root, faults=[moment]).code == 130
-    pipeline = pipeline_at(root)
-    pipeline.run("train")
-    assert same_weights(pipeline.training.path / "manifold.pt", chain.checkpoint)
-
-
 @pytest.mark.slow
 def test_control_c_from_outside(tiny, tmp_path, pipeline_at):
     """The real command, interrupted from another process as soon as it works."""

@@ -241,12 +241,6 @@ def test_what_is_not_deployed_together_is_refused_before_any_work(nsf):
     assert "deploy.batch=1" in err
 
 
-def test_a_removed_key_of_teaching_names_its_remedy(nsf):
-    code, _, err = nsf("run", "model=recurrence", "model.teaching.memory=[0.1]")
-    assert code == 2
-    assert "model.teaching.memory was removed; set model.stress" in err
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_where_there_is_none(nsf, tmp_path):
     code, _, err = nsf("run", "device=cuda")
@@ -275,17 +269,6 @@ def test_unknown_stage(nsf, stage, near):
     assert code == 2
     assert f"unknown stage '{stage}'" in err
     assert near in err
-
-
-@pytest.mark.parametrize(
-    ("stage", "needed"),
-    [("train", "nsf simulate"), ("deploy", "nsf train"), ("evaluate", "nsf deploy"), ("report", "nsf run")],
-)
-def test_a_stage_before_its_time_names_the_command(nsf, tmp_path, stage, needed):
-    code, _, err = nsf(stage)
-    assert code == 2
-    assert f"run `{needed}" in err
-    assert not [p for p in files(tmp_path) if p.name != "manifest.json"]
 
 
 def test_point_gives_the_laws_values(nsf, tmp_path):

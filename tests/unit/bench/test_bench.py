@@ -306,12 +306,12 @@ def test_networks_have_a_row(tiny, chain):
 
 
 def test_training_is_timed_from_its_files(chain):
-    found, said = measurements()
+    found, said = measurements(trials=1)
     measured_training(again(chain), found)
     (row,) = found.rows
     assert (row["case"], row["what"], row["particles"]) == ("training_sand", "training", 500)
-    assert row["p10"] < row["median"] < row["p90"]
-    assert len([line for line in said if not line.startswith("warning")]) == 2
+    assert row["median"] > 0
+    assert len([line for line in said if not line.startswith("warning")]) == 1
 
 
 # -- sizes ----------------------------------------------------------------------------------------------

@@ -303,9 +303,9 @@ def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, optio
         (["transfer=pic"], {}, "share the transfer"),
     ],
 )  # fmt: skip
-def test_what_must_be_the_same(tiny, setup_of, overrides, options, message):
-    scenes = [nsf.load_scene("sand", [*tiny[1:], *more]) for more in ([], overrides)]
-    setups = [setup_of(scenes[0]), setup_of(scenes[1], angle=30.0, **options)]
+def test_what_must_be_the_same(tiny, tiny_scene, setup_of, overrides, options, message):
+    other = nsf.load_scene("sand", [*tiny[1:], *overrides]) if overrides else tiny_scene
+    setups = [setup_of(tiny_scene), setup_of(other, angle=30.0, **options)]
     with pytest.raises(ConfigError, match=re.escape(message)) as error:
         together(*setups)
     assert "friction_angle=30" in str(error.value)

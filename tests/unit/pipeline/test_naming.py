@@ -5,10 +5,7 @@ import shutil
 import pytest
 
 from nsf import config
-from nsf.config.scenes import config_of, scene_of
-from nsf.paths import groups
 from nsf.pipeline import Pipeline
-from nsf.scenes.identity import plain_scene
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 STAGES = ("simulate", "train", "deploy", "evaluate")
@@ -64,14 +61,6 @@ def test_a_mesh_enters_by_its_content(tmp_path, monkeypatch):
     assert others == [one] * 3
     (tmp_path / "x.obj").write_text(TETRAHEDRON.replace("0 0 1", "0 0 2"))
     assert not set(one["simulate"]) & set(names("scene.geometry.mesh=x.obj", scene="drop")["simulate"])
-
-
-@pytest.mark.parametrize("name", groups()["scene"])
-def test_a_scene_survives_the_way_through_a_configuration(name):
-    """From values to keys and back."""
-    c = config.load([f"scene={name}", "scale=small", "device=cpu"])
-    scene = scene_of(c)
-    assert plain_scene(scene_of(config_of(scene))) == plain_scene(scene)
 
 
 def test_encoded_runs_are_among_what_a_sweep_needs():
