@@ -72,7 +72,7 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     if needs_others and not group:
         from nsf.pipeline.preview import stages_of, time_of
 
-        say(f"run: {time_of(stages_of([pipeline.check()]))} to go; `nsf plan` says of what")
+        say(f"run: {time_of(stages_of([pipeline.check()]))} to go")
     with pipeline.tracked, reserving(pipeline.inputs if needs_others else ()):
         for at, name in enumerate(stages):
             with timed(name):
