@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from functools import cache
 
 import numpy as np
+from scipy.special import ndtr
 
 #: Share of runs in which a bound holds.
 LEVEL = 0.9
@@ -38,16 +39,16 @@ def widening(runs: int) -> float:
     For scores that are log-normal with the deviation `SCATTER`; 1 of `ENOUGH` scores and more, where the
     ranks alone promise it.
     """
-    from scipy.optimize import brentq
-    from scipy.stats import norm
-
     if runs >= ENOUGH:
         return 1.0
     z = np.linspace(-8.0, 8.0, 2001)
-    largest = runs * norm.pdf(z) * norm.cdf(z) ** (runs - 1)
-    return float(
-        np.exp(SCATTER * brentq(lambda c: np.trapezoid(norm.cdf(z + c) * largest, z) - LEVEL, -8, 8))
-    )
+    largest = runs * np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi) * ndtr(z) ** (runs - 1)
+    low, high = -8.0, 8.0
+    while high - low > 1e-12:
+        middle = 0.5 * (low + high)
+        below = np.trapezoid(ndtr(z + middle) * largest, z) < LEVEL
+        low, high = (middle, high) if below else (low, middle)
+    return math.exp(SCATTER * low)
 
 
 def factor_of(scores: Sequence[float]) -> float:

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ FORMAT = "nsf-recurrence"
 FORMAT_VERSION = 1
 _DIGITS = 12
 _SAME = 1e-9  # of a range: what round-off may move
+#: Of manifolds, with the places and versions of their tensors.
+_HASHES: WeakKeyDictionary = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -128,9 +131,17 @@ def _ratio(off: float, reach: float, size: float) -> float:
 
 
 def manifold_hash(manifold) -> str:
-    """Hash of every tensor of a manifold."""
-    digest = hashlib.sha256(manifold.field.encode())
-    for name, tensor in manifold.state_dict().items():
+    """Hash of every tensor of a manifold, taken once for all runs of it."""
+    tensors = manifold.state_dict()
+    now = tuple((tensor.data_ptr(), tensor._version) for tensor in tensors.values())
+    if _HASHES.get(manifold, ((), ""))[0] != now:
+        _HASHES[manifold] = now, _hash_of(manifold.field, tensors)
+    return _HASHES[manifold][1]
+
+
+def _hash_of(field: str, tensors: Mapping[str, torch.Tensor]) -> str:
+    digest = hashlib.sha256(field.encode())
+    for name, tensor in tensors.items():
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
     return digest.hexdigest()[:_DIGITS]
