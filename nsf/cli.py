@@ -109,7 +109,7 @@ def _dispatch(arguments: list[str]) -> int:
     if launcher:
         raise ConfigError(f"{launcher[0]} is about the jobs of a sweep; add -m")
     loaded = config.load(overrides, usage.primary(stage))  # refused before the import of what would use it
-    from nsf.pipeline.sweep import work
+    from nsf.pipeline.sweeps.jobs import work
 
     result = work(loaded, _stages(stage))
     if stage in ("run", "report"):
@@ -240,7 +240,7 @@ def _plan(arguments: list[str]) -> int:
     words.check("plan", [word for word in overrides if not word.startswith("~")])
     keys = [o for o in overrides if not o.startswith("+experiment=") and not config.of_launcher(o)]
     if names := [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]:
-        from nsf.pipeline.experiment import Experiment
+        from nsf.pipeline.sweeps.experiment import Experiment
 
         jobs = [job.overrides for job in Experiment.load(names[-1], keys).jobs]
     else:
@@ -261,7 +261,7 @@ def _reports(arguments: list[str]) -> int:
     """The page of all reports and their charts, or what is wrong with them; 2 if something is."""
     readers = {"folder": words.text, "check": words.flag, "html": words.flag}
     options = words.values("reports", arguments, readers)
-    from nsf.pipeline.experiment import questions
+    from nsf.pipeline.sweeps.experiment import questions
     from nsf.results.committed import faults, write_list
 
     folder = Path(options.get("folder", reports_folder()))
@@ -278,7 +278,7 @@ def _reports(arguments: list[str]) -> int:
 def _search(arguments: list[str]) -> int:
     """Trials until there are enough, and the best of them."""
     words.check("search", arguments)
-    from nsf.pipeline.search import best, search
+    from nsf.pipeline.sweeps.search import best, search
     from nsf.results.search import best_table
 
     chart = search(arguments)
@@ -304,7 +304,7 @@ def _stages(stage: str) -> tuple[str, ...]:
 
 def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]) -> int:
     """A stage, or the whole chain, of an experiment's jobs, and its report; 2 if something is missing."""
-    from nsf.pipeline.experiment import Experiment
+    from nsf.pipeline.sweeps.experiment import Experiment
     from nsf.progress import timed
 
     if stage == "point":
@@ -327,7 +327,7 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
 
 def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
     """Every combination of comma-separated values, and the report of each scene; 2 if a job failed."""
-    from nsf.pipeline.sweep import check_report_folders, reports
+    from nsf.pipeline.sweeps.jobs import check_report_folders, reports
 
     if stage == "run":
         check_report_folders(overrides)
@@ -340,12 +340,12 @@ def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
 
 def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: Sequence[str] = ()) -> int:
     """The stage of every job, or the chain up to the report, which is made once all are done, and `more`."""
-    from nsf.pipeline.sweep import sweep
+    from nsf.pipeline.sweeps.jobs import sweep
 
     stages = (*(s for s in _stages(stage) if s != "report"), *more)
     failed = sweep(sweeps, stages, launcher, usage.primary(stage))
     if "evaluate" in stages:
-        from nsf.pipeline.outcome import outcome
+        from nsf.pipeline.sweeps.outcome import outcome
         from nsf.results.formats import TerminalTable
 
         if ended := outcome(sweeps, {" ".join(failure.job): failure.error for failure in failed}):

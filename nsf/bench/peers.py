@@ -10,7 +10,7 @@ from nsf.bench.rows import Case, Measurements, size_name
 from nsf.errors import MissingExtraError
 from nsf.extras import optional
 from nsf.mpm import DomainWalls, FullOrderMPM
-from nsf.pipeline.cores import cores
+from nsf.pipeline.stages.cores import cores
 
 _STEPS = 60  # of a run that is timed
 _MARGIN = 8  # [cells] around the body, which moves by half of one meanwhile

@@ -202,7 +202,7 @@ def _full_order(pipeline) -> float:
 
 def _side_by_side(pipeline, count: int) -> float:
     """Some full-order runs, which processes share."""
-    from nsf.pipeline.cores import helper_count
+    from nsf.pipeline.stages.cores import helper_count
 
     nbytes = host_bytes(pipeline.scene, pipeline.config.precision, pipeline.stored)
     helpers = helper_count(pipeline.device, [pipeline.scene] * count, nbytes) if count else 0

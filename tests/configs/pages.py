@@ -11,8 +11,8 @@ from nsf.bench import BENCHES
 from nsf.cli import TOOLS, main
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline import Pipeline
-from nsf.pipeline.experiment import Experiment
-from nsf.pipeline.search import Range
+from nsf.pipeline.sweeps.experiment import Experiment
+from nsf.pipeline.sweeps.search import Range
 
 ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)

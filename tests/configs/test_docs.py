@@ -14,7 +14,7 @@ from pages import ROOT, blocks, try_command
 import nsf
 from nsf import config, find, paths
 from nsf.pipeline import Pipeline
-from nsf.pipeline.experiment import Experiment
+from nsf.pipeline.sweeps.experiment import Experiment
 
 DOCS = ROOT / "docs"
 #: What is written for readers of the code has signatures, not programs.

@@ -9,7 +9,7 @@ import yaml
 from nsf import config
 from nsf.paths import CONF, EXPERIMENTS, groups
 from nsf.pipeline import Pipeline
-from nsf.pipeline.experiment import Experiment
+from nsf.pipeline.sweeps.experiment import Experiment
 
 NAMES = sorted(path.stem for path in EXPERIMENTS.glob("*.yaml"))
 #: The same, with a name for each part.

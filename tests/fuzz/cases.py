@@ -306,7 +306,7 @@ def experiments(shop: Workshop, draw: random.Random) -> Case:
         data = data.encode("utf-8", "surrogatepass") if isinstance(data, str) else data
 
     def run() -> None:
-        from nsf.pipeline.experiment import Experiment
+        from nsf.pipeline.sweeps.experiment import Experiment
 
         folder = shop.folder / "experiments"
         folder.mkdir(exist_ok=True)

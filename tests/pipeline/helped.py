@@ -3,7 +3,7 @@
 import os
 
 from nsf.errors import InstabilityError
-from nsf.pipeline import cores
+from nsf.pipeline.stages import cores
 
 
 def count(number, advance, folder):

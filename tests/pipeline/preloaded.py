@@ -10,7 +10,7 @@ from nsf.pipeline import stages
 
 for name in (
     *("torch", "warp", "pytorch_lightning", "h5py", "scipy.spatial", "matplotlib.backends.backend_svg"),
-    *("nsf.cli", "nsf.pipeline.sweep", "nsf.pipeline.experiment", "nsf.results.report"),
+    *("nsf.cli", "nsf.pipeline.sweeps.jobs", "nsf.pipeline.sweeps.experiment", "nsf.results.report"),
     *(f"nsf.pipeline.stages.{module.name}" for module in pkgutil.iter_modules(stages.__path__)),
 ):
     importlib.import_module(name)

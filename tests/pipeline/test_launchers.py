@@ -13,8 +13,8 @@ from forked import SignalAt
 
 from nsf import config as configuration
 from nsf.errors import ConfigError, LaunchError, MissingExtraError
-from nsf.pipeline import sweep as module
-from nsf.pipeline.sweep import sweep
+from nsf.pipeline.sweeps import jobs as module
+from nsf.pipeline.sweeps.jobs import sweep
 from nsf.runs import Run
 
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed")

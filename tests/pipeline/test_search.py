@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from nsf.errors import ConfigError, MissingExtraError, MissingRunError, SchemaError
-from nsf.pipeline.search import Range, best, search
+from nsf.pipeline.sweeps.search import Range, best, search
 from nsf.runs import Run
 
 pytest.importorskip("optuna", reason="optuna is not installed; pip install 'nsf[search]'")

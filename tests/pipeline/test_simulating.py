@@ -13,7 +13,7 @@ from nsf.data import Trajectory, TrajectoryWriter
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.gpu import without_collection
-from nsf.pipeline import cores, trajectories
+from nsf.pipeline.stages import cores, trajectories
 from nsf.progress import Progress
 
 

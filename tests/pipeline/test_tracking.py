@@ -7,7 +7,8 @@ import pytest
 
 from nsf.config import load
 from nsf.errors import MissingExtraError, NSFError
-from nsf.pipeline import sweep, tracking
+from nsf.pipeline import tracking
+from nsf.pipeline.sweeps import jobs as sweep
 from nsf.pipeline.tracking import EXTRAS, Tool, as_text, figures
 from nsf.runs.listing import flat
 

@@ -12,7 +12,7 @@ from nsf import config, load_scene
 from nsf.config import targets
 from nsf.errors import ConfigError, NSFError
 from nsf.paths import CONF, groups
-from nsf.pipeline.sweep import sweep
+from nsf.pipeline.sweeps.jobs import sweep
 
 #: Callables of this package, which are no class that a key expects, and what they would need.
 CALLABLES = [
@@ -279,7 +279,7 @@ def test_a_scene_sets_nothing_of_hydra(conf, tmp_path):
 
 
 def test_an_experiment_sets_nothing_of_hydra(tmp_path):
-    from nsf.pipeline.experiment import Experiment
+    from nsf.pipeline.sweeps.experiment import Experiment
 
     marker = tmp_path / "executed"
     (tmp_path / "evil.yaml").write_text(

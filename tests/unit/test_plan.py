@@ -13,7 +13,7 @@ from nsf.cli import main
 from nsf.config import load
 from nsf.pipeline import Pipeline, preview
 from nsf.pipeline.durations import FILE, Work, interval, times
-from nsf.pipeline.outcome import outcome
+from nsf.pipeline.sweeps.outcome import outcome
 from nsf.progress import Progress, label, labelled
 from nsf.scenes.resolution import resolution_warnings
 

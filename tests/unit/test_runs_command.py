@@ -215,7 +215,7 @@ def test_a_killed_sweep_needs_nothing(root):
 
 
 def test_a_sweep_names_what_it_needs(tmp_path, monkeypatch):
-    from nsf.pipeline import sweep
+    from nsf.pipeline.sweeps import jobs as sweep
 
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))
     seen: set[str] = set()

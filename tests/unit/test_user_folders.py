@@ -9,7 +9,7 @@ import pytest
 from nsf import config, paths
 from nsf.cli import main
 from nsf.errors import ConfigError
-from nsf.pipeline.experiment import Experiment
+from nsf.pipeline.sweeps.experiment import Experiment
 
 SCENE = """\
 # @package _global_

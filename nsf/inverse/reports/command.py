@@ -264,7 +264,7 @@ def _runs(named: str | None, experiment: str | None) -> list[Run]:
         return [Run.named(name, "deploy").require() for name in named.split(",")]
     from nsf import config
     from nsf.pipeline import Pipeline
-    from nsf.pipeline.experiment import Experiment
+    from nsf.pipeline.sweeps.experiment import Experiment
 
     runs = [Pipeline(config.load(job.overrides)).deployment for job in Experiment.load(experiment).jobs]
     if missing := [run for run in runs if not run.complete]:

@@ -19,7 +19,7 @@ from nsf.errors import InstabilityError
 from nsf.kinematics.manifold import Manifold
 from nsf.models.inputs import Lessons
 from nsf.models.lookup import inputs_in
-from nsf.pipeline.cores import Advance, claimed, helper_count, helping
+from nsf.pipeline.stages.cores import Advance, claimed, helper_count, helping
 from nsf.progress import Progress
 from nsf.recurrence.stream import (
     Encoded,

@@ -10,8 +10,8 @@ import numpy as np
 
 from nsf.data import Case
 from nsf.data.motion import FLAT, RIGID, STILL
-from nsf.pipeline import cores, trajectories
-from nsf.pipeline.trajectories import Job, Shared, simulate
+from nsf.pipeline.stages import cores, trajectories
+from nsf.pipeline.stages.trajectories import Job, Shared, simulate
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.scenes.checks import host_bytes

@@ -5,7 +5,7 @@ import textwrap
 import pytest
 
 from nsf.errors import ConfigError
-from nsf.pipeline.experiment import Experiment
+from nsf.pipeline.sweeps.experiment import Experiment
 
 TEXT = """
 title: A title

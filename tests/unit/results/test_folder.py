@@ -5,7 +5,7 @@ import json
 import pytest
 
 from nsf.errors import ConfigError
-from nsf.pipeline.experiment import Experiment
+from nsf.pipeline.sweeps.experiment import Experiment
 from nsf.results.folder import MARK, check_place, replaced
 
 CONTENT = {"title": "Heap", "runs": {}, "files": {"index.md": "00"}}

@@ -14,7 +14,7 @@ from nsf.canonical import content_hash
 from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, first_line
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
-from nsf.pipeline.outcome import best_text
+from nsf.pipeline.sweeps.outcome import best_text
 from nsf.results.search import OBJECTIVES, write_search
 from nsf.results.table import parsed, read
 from nsf.storage import locked

@@ -22,7 +22,7 @@ from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
-from nsf.pipeline.cores import Advance, helping
+from nsf.pipeline.stages.cores import Advance, helping
 from nsf.progress import Progress
 from nsf.runs import Run
 

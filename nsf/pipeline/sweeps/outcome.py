@@ -26,7 +26,7 @@ def outcome(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> tuple
 
     Args:
         sweeps: overrides whose keys may have several values.
-        failed: error by what tells the job apart, as of `nsf.pipeline.sweep.Failure`.
+        failed: error by what tells the job apart, as of `nsf.pipeline.sweeps.jobs.Failure`.
     """
     jobs = [dict(override.split("=", 1) for override in job) for job in configuration.jobs(sweeps)]
     keys = list(dict.fromkeys(key for job in jobs for key in job))
