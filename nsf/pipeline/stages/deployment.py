@@ -36,6 +36,7 @@ from nsf.progress import START, seconds_of
 from nsf.runs import Record, Run
 from nsf.storage import writing
 
+_WIDE = 1.1  # factor on error bounds from which more validation cases are worth their runs
 #: File of a deploy run with the configuration of its whole chain, interpolations kept.
 CONFIGURATION = "configuration.yaml"
 
@@ -59,7 +60,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
         runs = len(trust.calibration.errors) if trust.calibration else 0
         if runs and runs == len(pipeline.validating.held_out):  # else the worst of them do not count
             record.metrics["validation_error"] = float(trust.calibration.errors.mean())
-        if 0 < runs < ENOUGH:
+        if runs and widening(runs) >= _WIDE:
             pipeline.say(
                 f"deploy: {runs} validation run{'s' * (runs > 1)} set the error bounds, which are "
                 f"{widening(runs):.2g} times as wide as of {ENOUGH}; add cases to scene.design.validation"
