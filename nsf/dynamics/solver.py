@@ -126,7 +126,8 @@ class ReducedBatch:
                 self._begin_step()
                 if self._span.latent_only:
                     steps = min(last, self._end_of_span()) - self.steps_taken
-                    self._span.take(steps)
+                    with on_torch_stream(self.device):
+                        self._span.take(steps)
                 else:
                     steps = 1
                     self._advance()
