@@ -75,39 +75,20 @@ def drive(
     return result
 
 
-def _simple_shear(s: np.ndarray) -> np.ndarray:
-    F = np.tile(np.eye(3), (len(s), 1, 1))
-    F[:, 0, 1] = s
+def _identity_but(row: int, column: int, values: np.ndarray) -> np.ndarray:
+    """The identity [n, 3, 3] with other values [n] in one place."""
+    F = np.tile(np.eye(3), (len(values), 1, 1))
+    F[:, row, column] = values
     return F
-
-
-def _uniaxial_strain(s: np.ndarray) -> np.ndarray:
-    F = np.tile(np.eye(3), (len(s), 1, 1))
-    F[:, 0, 0] = 1.0 + s
-    return F
-
-
-def _oedometer(s: np.ndarray) -> np.ndarray:
-    F = np.tile(np.eye(3), (len(s), 1, 1))
-    F[:, 2, 2] = 1.0 - s
-    return F
-
-
-def _isotropic_compression(s: np.ndarray) -> np.ndarray:
-    return (1.0 - s)[:, None, None] * np.eye(3)
-
-
-def _cyclic_shear(s: np.ndarray) -> np.ndarray:
-    return _simple_shear(s.max() * np.sin(2.0 * np.pi * s / s.max()))
 
 
 #: Deformation paths by name: amplitude s [n] (dimensionless, growing from 0) → F [n, 3, 3].
 PATHS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "simple_shear": _simple_shear,
-    "uniaxial_strain": _uniaxial_strain,
-    "oedometer": _oedometer,
-    "isotropic_compression": _isotropic_compression,
-    "cyclic_shear": _cyclic_shear,
+    "simple_shear": lambda s: _identity_but(0, 1, s),
+    "uniaxial_strain": lambda s: _identity_but(0, 0, 1.0 + s),
+    "oedometer": lambda s: _identity_but(2, 2, 1.0 - s),
+    "isotropic_compression": lambda s: (1.0 - s)[:, None, None] * np.eye(3),
+    "cyclic_shear": lambda s: _identity_but(0, 1, s.max() * np.sin(2.0 * np.pi * s / s.max())),
 }
 
 
