@@ -26,7 +26,7 @@ CASES = [
     pytest.param(
         "cantilever",
         [],
-        {f"{of}/L at P L²/EI = {ratio}": 3.0 for of in "wu" for ratio in (1, 2, 5, 10)},
+        {f"w/L at P L²/EI = {ratio}": 2.0 for ratio in (1, 2, 5, 10)} | {"u/L at P L²/EI = 1": 1.0},
         id="cantilever",
         marks=SLOW,
     ),
