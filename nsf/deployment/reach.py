@@ -1,6 +1,5 @@
 """Ranges of parameters, forcing and states in training and teaching; outside of them no bound holds."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +7,6 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from nsf.deployment.bound import LEVEL
 from nsf.recurrence.solids import FEATURES
 from nsf.vectors import drawn
 
@@ -20,6 +18,8 @@ _AGAIN = 2.0
 _LEAST, _MOST = 0.1, 1.0
 #: States of runs by which others are judged, at most, and frames of a run that are looked at, about.
 _ROWS, _FRAMES = 1024, 64
+#: Runs whose quartiles tell of outliers, at least; ranges between quartiles from the upper one to an outlier.
+_FEWEST, _FENCE = 8, 1.5
 
 
 @dataclass(frozen=True)
@@ -100,12 +100,14 @@ class Usual:
     """Latent states of runs that taught a model, and how near to others each of these runs keeps.
 
     A range says little where a few runs go far: one of twenty falls over, say, and widens it for all. So each
-    run is held to the states of all others, and a new one is usual that goes no further than most of them.
+    run is held to the states of all others, and a new one is usual that is no outlier among them.
+
+    Source: Tukey 1977, Exploratory Data Analysis: an outlier is one and a half interquartile ranges above the
+    upper quartile.
 
     Attributes:
         rows: [K, r] [m] states of all runs.
-        leeway: distance [m] to the nearest of the others that a share of `LEVEL` of the runs never passes, as
-            of those in which a bound holds.
+        leeway: distance [m] to the nearest of these beyond which a run is an outlier.
         every: steps from one frame that is looked at to the next.
     """
 
@@ -121,15 +123,15 @@ class Usual:
             runs: every so many steps.
             every: steps from one of their frames to the next.
         """
-        rank = math.ceil((len(runs) + 1) * LEVEL - 1e-9)
-        if rank > len(runs):
+        if len(runs) < _FEWEST:
             return None
         apart = max(1, runs.shape[1] // _FRAMES)
         frames = runs[:, ::apart]
         chosen = drawn(frames.shape[0] * frames.shape[1], _ROWS)
         rows, owners = frames.reshape(-1, frames.shape[2])[chosen], chosen // frames.shape[1]
         farthest = [_nearest(one, rows[owners != run]).max() for run, one in enumerate(frames)]
-        return cls(rows, float(np.sort(farthest)[rank - 1]), every * apart)
+        lower, upper = np.quantile(farthest, (0.25, 0.75))
+        return cls(rows, float(upper + _FENCE * (upper - lower)), every * apart)
 
     def left(self, rows: np.ndarray, every: int) -> np.ndarray:
         """[N] whether a run with states [N, r] [m] is further off, at each `every`-th; False at others."""
