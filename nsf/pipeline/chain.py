@@ -62,6 +62,7 @@ class Pipeline(Configured):
     def __init__(self, config: DictConfig, say: Callable[[str], object] = print, root: Path | None = None):
         self.say, self.root = say, root
         self._chosen: Model | None = None
+        self._learned: Run | None = None
         self._simulations: dict[tuple[Case, int], Run] = {}
         self._samples = self._sets = self._taught = self._fitted = None
         super().__init__(config)
@@ -85,6 +86,7 @@ class Pipeline(Configured):
         pipeline = cls(config, say, run.root)
         if isinstance(pipeline.configured, Auto):
             pipeline.choose(run.metric("model", kind=str))
+        pipeline._learned = next((parent for parent in run.parent_runs if parent.stage == "teach"), None)
         return pipeline
 
     def _repr_html_(self) -> str:
@@ -206,10 +208,14 @@ class Pipeline(Configured):
 
     training = property(naming.training)
     encoding = property(naming.encoding)
-    taught = property(naming.taught)
     deployment = property(naming.deployment)
     evaluation = property(naming.evaluation)
     superresolution = property(naming.superresolution)
+
+    @property
+    def taught(self) -> Run:
+        """What the model learned; of a chain that is opened from a deployment, on whatever device it did."""
+        return self._learned or naming.taught(self)
 
     def runs_of(self, stage: str) -> list[Run]:
         """The runs of a stage, each once; none of `encode` and `teach` where nothing is taught."""

@@ -1,5 +1,6 @@
 """The chain that a deploy run is part of, from the run alone."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ from omegaconf import OmegaConf
 from nsf.errors import ConfigError, SchemaError
 from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.deployment import CONFIGURATION
+from nsf.runs import Run
 
 
 def test_the_same_chain_comes_out(chain):
@@ -28,6 +30,15 @@ def test_a_run_on_another_device_has_the_same_training(chain, tmp_path, seal):
         Pipeline.of_run(run, device="cpu")
     seal(run)
     assert Pipeline.of_run(run, device="cpu").training.complete
+
+
+def test_what_was_learned_on_another_device_is_that_of_the_deployment(chain, tmp_path):
+    shutil.copytree(chain.root, tmp_path / "runs")
+    run = Run.named(chain.pipeline.deployment.id, "deploy", tmp_path / "runs")
+    manifest = json.loads((run.path / "manifest.json").read_text())
+    manifest["parents"].append("teach/sand/0123456789ab")  # whose name has the device
+    (run.path / "manifest.json").write_text(json.dumps(manifest))
+    assert Pipeline.of_run(run, device="cpu").taught.id == "teach/sand/0123456789ab"
 
 
 @pytest.mark.parametrize(
