@@ -104,7 +104,6 @@ WIDTH = 9.6  # [inch] 960 px at 100 dpi: the width of a report's column
 PIXELS = 120  # an inch of a png: sharp at that width, and a report of many pictures stays small
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 LOST_MARK = {"ls": "", "marker": "X", "ms": 8, "mec": "white", "mew": 0.8}
-_DOTS = 200  # values of which each is in sight; of more, as of many frames, an axis leaves the smallest out
 _COLORS = 256
 _RAMP = 64  # colours kept of each colour scale: its bar shows no steps
 # Of text, and of floors and their shadows, whose soft edges would else become contours.
@@ -201,8 +200,13 @@ def _is_invisible(handle) -> bool:
     return len(points) > 0 and not np.isfinite(points).all(axis=1).any()
 
 
-def error_scale(panel, values, along: str = "y") -> None:
-    """Logarithmic once the errors span more than a factor of 30, else linear from zero; to `LOST` at most."""
+def error_scale(panel, values, along: str = "y", hidden: float = 0.0) -> None:
+    """Logarithmic once the errors span more than a factor of 30, else linear from zero; to `LOST` at most.
+
+    Args:
+        panel, values, along: whose axis is scaled for which values.
+        hidden: share of the smallest that a logarithmic axis leaves out.
+    """
     values = np.asarray(values, float)
     values = np.minimum(values[np.isfinite(values) & (values > 0)], LOST)
     panel.grid(axis=along)
@@ -210,8 +214,7 @@ def error_scale(panel, values, along: str = "y") -> None:
     logarithmic = len(values) > 0 and np.max(values) > 30 * np.quantile(values, 0.05)
     if logarithmic:
         panel.set(**{f"{along}scale": "log"})
-        smallest = np.quantile(values, 0.02 if len(values) > _DOTS else 0.0)
-        limits = (smallest / 1.6, np.max(values) * 1.6)
+        limits = (np.quantile(values, hidden) / 1.6, np.max(values) * 1.6)
     panel.set(**{f"{along}lim": limits})
     if logarithmic:
         plain_ticks(getattr(panel, f"{along}axis"))

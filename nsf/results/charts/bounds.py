@@ -1,5 +1,7 @@
 """Whether error bounds held: rows of results as a table, a row a body and model, and as a chart."""
 
+import math
+
 import numpy as np
 import pandas as pd
 
@@ -72,7 +74,7 @@ def error_bounds(view: View) -> Figures:
     if rows["error_bound"].nunique() < 2:
         return {}
     groups = list(rows.groupby("body", sort=False))
-    across = 2 if len(groups) == 1 else 4
+    across = min(4, math.ceil((len(groups) + 1) / 2)) if len(groups) > 1 else 2
     fig, (*each, holds) = panels(len(groups) + 1, 7.6 / across, across)
     bounds, moved = rows["error_bound"], rows["displacement_error"]
     ends = [50 * min(bounds.min(), moved[moved > 0].min()), min(200 * bounds.max(), LOST)]

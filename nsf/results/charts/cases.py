@@ -38,6 +38,7 @@ COLORS = "viridis"
 _FEWEST = 12  # cases of which means of neighbours say anything
 _CROSS = {"ls": "", "marker": "x", "ms": 4, "mew": 0.9, "color": "#aaaaaa"}
 _MAPS = 4  # in a row
+_MOST = 6  # variants over a parameter
 _WIDEST = 28  # letters of a line above a map
 
 
@@ -48,7 +49,7 @@ _WIDEST = 28  # letters of a line above a map
 )
 def error_over_parameters(view: View) -> Figures:
     """Errors over each parameter of each body, a panel each."""
-    planes = [(body, part, name) for body, part, names in _several(view) for name in names]
+    planes = [(body, _few(part), name) for body, part, names in _several(view) for name in names]
     if not planes:
         return {}
     drawn = styles(view.frame.assign(variant=view.frame["variant"].map(base)), "variant")
@@ -107,6 +108,14 @@ def _maps(view: View, planes: list) -> Figure:
     return fig
 
 
+def _few(part: pd.DataFrame) -> pd.DataFrame:
+    """The rows of a body; where they would not be told apart, of the best variant of each model."""
+    if part["variant"].nunique() <= _MOST:
+        return part
+    ranked = sorted(part.groupby("variant", sort=False), key=lambda one: _rank(_within(one[1])))
+    return pd.concat({of["model_name"].iloc[0]: of for _, of in reversed(ranked)}.values())
+
+
 def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
     """Bodies whose cases have several values: their rows with a column a parameter, and these names.
 
@@ -123,7 +132,8 @@ def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
         names = [name for name in next(iter(cases.values())) if name != PROGRAM]
         if all(len(case) < 2 for case in cases.values()) or not names:
             continue
-        errors = part.groupby(["scene", "variant", "case", "beyond"], sort=False)["displacement_error"]
+        by = ["scene", "model_name", "variant", "case", "beyond"]
+        errors = part.groupby(by, sort=False)["displacement_error"]
         rows = errors.agg(whole_mean).rename("error").reset_index().dropna(subset="error")
         rows["lost"] = ~(100 * rows["error"] <= LOST)
         yield body, rows.assign(**{n: [cases[text][n] for text in rows["case"]] for n in names}), names

@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.data.case import PROGRAM
-from nsf.results.charts.drawing import ERROR, finite, in_lines, mark, row_panels, styles, whole_mean
+from nsf.results.charts.drawing import ERROR, base, finite, in_lines, mark, row_panels, styles, whole_mean
 from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import COLUMNS, RIVALS, SEEDS, column
 from nsf.results.formats import file_name
@@ -24,56 +24,58 @@ from nsf.results.style import (
     panels,
     plain_ticks,
 )
-from nsf.results.table import variants
+from nsf.results.table import BEYOND, variants
 
 _FEW = 10  # δ at a number of which each is a dot, and no mean or range
+_THE_PAPER = {"ms": 8, "color": PAPER, "zorder": 1.5, "label": "the paper"}  # below the dots
 _LOG = ("sampler.size", "training_runs", "trainer.steps", "particles", "train_seconds", "sampler.cells")
 
 
 @chart(
     "Displacement error at each held-out program, the mean over seeds (dots), and their median (line): of "
-    "every model, and below the line of rivals that need none. A dot at the right edge is a lost run; "
-    "(beyond) are programs that led beyond what was taught."
+    "every model, and below the line of rivals that need none. A dot at the right edge is a lost run, "
+    "a filled one, which is in no median, a program that led beyond what was taught."
 )
 def programs(view: View) -> Figures:
     """Displacement error of every program by model, a panel a body; of scenes that programs force."""
     forced = view.frame[view.frame["case"].str.contains(f"{PROGRAM}=")]
     if forced.empty:
         return {}
+    forced = forced.assign(variant=forced["variant"].map(base), beyond=forced["variant"].str.endswith(BEYOND))
     groups = list(forced.groupby("body", sort=False))
     rivals = [[name for name in RIVALS if part[name].notna().any()] for _, part in groups]
     counts = [part["variant"].nunique() + len(of) for (_, part), of in zip(groups, rivals, strict=True)]
     fig, drawn = row_panels(counts, 0.32, 0.9)
     for panel, (body, part), of in zip(drawn, groups, rivals, strict=True):
-        variants_of = list(part.groupby("variant", sort=False))
-        rows = [
-            (name, _of_programs(one["displacement_error"], one), model_color(one["model_name"].iloc[0]))
-            for name, one in variants_of
-        ]
-        rows += [(COLUMNS[n].title, _of_programs(part[n], part), RIVAL_COLORS[n]) for n in of]
-        error_scale(panel, np.concatenate([errors for _, errors, _ in rows]), "x")
-        for y, (_, errors, color) in enumerate(rows):
+        models = list(part.groupby("variant", sort=False))
+        rows = {
+            name: (_of_programs(one, "displacement_error"), model_color(one["model_name"].iloc[0]))
+            for name, one in models
+        }
+        rows |= {COLUMNS[n].title: (_of_programs(part, n), RIVAL_COLORS[n]) for n in of}
+        error_scale(panel, np.concatenate([errors for errors, _ in rows.values()]), "x")
+        for y, (errors, color) in enumerate(rows.values()):
             _dots(panel, y, errors, color)
-        panel.axhline(len(variants_of) - 0.5, color=MUTED, lw=0.8)
-        panel.set_yticks(range(len(rows)), in_lines([name for name, *_ in rows], len(groups)))
+        panel.axhline(len(models) - 0.5, color=MUTED, lw=0.8)
+        panel.set_yticks(range(len(rows)), in_lines(rows, len(groups)))
         panel.set(title=body, xlabel=ERROR)
     return {"programs": fig}
 
 
-def _of_programs(errors: pd.Series, part: pd.DataFrame) -> np.ndarray:
-    """Errors [%] of each case, means over seeds; ∞ where one is lost, none where nothing was measured."""
-    return 100 * errors.groupby(part["case"]).agg(whole_mean).dropna().to_numpy()
+def _of_programs(part: pd.DataFrame, name: str) -> pd.Series:
+    """Errors [%] by whether a case led beyond what was taught, means over seeds; ∞ where one is lost."""
+    errors = 100 * part.groupby(["case", "beyond"])[name].agg(whole_mean).dropna()
+    return errors.droplevel("case")
 
 
-def _dots(panel, y: int, errors: np.ndarray, color: str) -> None:
-    """Errors [%] as dots in a row, with their median; those beyond the axis at its end."""
-    if not len(errors):  # an empty line that is not clipped has a box without end
-        return
-    edge = panel.get_xlim()[1]
-    panel.plot(
-        np.minimum(errors, edge), np.full(len(errors), y), "o", ms=4.5, mfc="white", mec=color, clip_on=False
-    )
-    if (middle := np.median(errors)) <= edge:
+def _dots(panel, y: int, errors: pd.Series, color: str) -> None:
+    """Errors [%] as dots in a row, with the median of those within; those beyond the axis at its end."""
+    edge, within = panel.get_xlim()[1], errors[~errors.index.to_numpy(bool)]
+    for of, face in ((within, "white"), (errors[errors.index.to_numpy(bool)], color)):
+        if len(of):  # an empty line that is not clipped has a box without end
+            style = {"ms": 4.5, "mfc": face, "mec": color, "clip_on": False}
+            panel.plot(np.minimum(of, edge), np.full(len(of), y), "o", **style)
+    if len(within) and (middle := np.median(within)) <= edge:
         panel.plot([middle] * 2, [y - 0.34, y + 0.34], color=color, lw=2.4)
 
 
@@ -116,7 +118,7 @@ def _deltas(panel, frame: pd.DataFrame, averages: pd.DataFrame) -> list[float]:
             place = {"textcoords": "offset points", "va": "center", "fontsize": 9, "color": MUTED}
             text, at_cross = "diverged" if np.isnan(average[y]) else "lost", panel.get_yaxis_transform()
             panel.annotate(text, (1.02, y), (6, 0), xycoords=at_cross, annotation_clip=False, **place)
-    panel.plot(100 * averages["paper_delta"], at, "X", ms=8, color=PAPER, label="the paper")
+    panel.plot(100 * averages["paper_delta"], at, "X", **_THE_PAPER)
     return every
 
 
@@ -167,12 +169,12 @@ def _over(frame: pd.DataFrame, key: str) -> Figure:
             panel.plot(free.index, free, "s", ms=4, color=model_color("interpolate"), label="interpolate")
         papers = part[[key, "paper_delta"]].dropna().drop_duplicates()
         if len(papers):
-            panel.plot(papers[key], 100 * papers["paper_delta"], "X", ms=8, color=PAPER, label="the paper")
+            panel.plot(papers[key], 100 * papers["paper_delta"], "X", **_THE_PAPER)
         error_scale(panel, [*every, *(100 * papers["paper_delta"])])
         panel.set(title=body, ylabel=COLUMNS["delta"].heading)
         panel.tick_params(labelbottom=True)
     fig.supxlabel(column(key).heading)
-    if len(steps := sorted(frame[key].unique())) <= _FEW and all(float(one).is_integer() for one in steps):
+    if len(steps := sorted(frame[key].unique())) <= _FEW:
         drawn[0].set_xticks(steps, [f"{one:,g}" for one in steps])
     if frame[key].min() > 0 and (key in _LOG or frame[key].max() > 10 * frame[key].min()):
         drawn[0].set_xscale("log")

@@ -30,7 +30,7 @@ def error_over_time(view: View) -> Figures:
         for panel, name in zip(drawn, shown, strict=True):
             _frames(panel, series, name, "reconstruction_delta" if name == "delta" else "", scale=100)
             panel.set(xlabel="time t [s]", ylabel=axis(column(name).title, "%"))
-            error_scale(panel, 100 * series[name])
+            error_scale(panel, 100 * series[name], hidden=0.02)
             panel.set_xlim(-0.01 * series["t"].max(), 1.01 * series["t"].max())
             panel.xaxis.set_major_locator(MaxNLocator(5))
         legend(fig, axis(*parameter(series["case"].iloc[0])))

@@ -57,7 +57,9 @@ def _section(reports: "Reports", name: str) -> dict:
     view = reports.views[name]
     averages, said = averaged(view.frame), []
     if len(averages) > _LONG:
-        averages = averages.loc[sorted(averages.groupby("body", sort=False)["delta"].idxmin().dropna())]
+        averages = averages.loc[
+            sorted(averages.groupby("body", sort=False)["displacement_error"].idxmin().dropna())
+        ]
         said.append("The best of each scene.")
     if averages["variant"].nunique() == 1:
         said.append(f"Model: {averages['model_name'].iloc[0]}.")
