@@ -287,7 +287,8 @@ def fingerprint(fig: Figure) -> str:
             if isinstance(ticks := axis.get_major_locator(), FixedLocator):
                 content.append(axis.get_major_formatter().format_ticks(ticks()))
         for line in panel.lines:
-            style = (line.get_color(), line.get_marker(), line.get_linestyle(), line.get_linewidth())
+            style = line.get_color(), line.get_marker(), line.get_linestyle(), line.get_linewidth()
+            style += (line.get_zorder(), line.get_markerfacecolor())
             content.append([_rounded(line.get_xydata()), list(map(str, style)), line.get_label()])
         for one in panel.collections:
             content += [_rounded(one.get_offsets()), _rounded(one.get_facecolor())]
