@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 from nsf.data.case import PROGRAM, Case
 from nsf.errors import ConfigError
-from nsf.results.charts.drawing import ERROR, base, line, styles, whole_mean
+from nsf.results.charts.drawing import ERROR, base, styles, whole_mean
 from nsf.results.charts.view import Figures, View, chart
 from nsf.results.columns import axis, number
 from nsf.results.style import (
@@ -24,7 +24,6 @@ from nsf.results.style import (
     MUTED,
     WARNING,
     WIDTH,
-    band,
     error_scale,
     figure,
     legend,
@@ -35,7 +34,6 @@ from nsf.results.table import BEYOND
 
 COLORS = "viridis"
 """Colour scale of the maps of errors."""
-_FEWEST = 12  # cases of which means of neighbours say anything
 _CROSS = {"ls": "", "marker": "x", "ms": 4, "mew": 0.9, "color": "#aaaaaa"}
 _MAPS = 4  # in a row
 _MOST = 6  # variants over a parameter
@@ -43,9 +41,9 @@ _WIDEST = 28  # letters of a line above a map
 
 
 @chart(
-    "Displacement error of held-out cases over each parameter, a dot a case, its mean over seeds; of "
-    "twelve cases or more a line is the mean over neighbours, its band from the smallest to the largest. "
-    "Crosses above are lost: they diverged or are off by more than 1,000 %."
+    "Displacement error of held-out cases over each parameter, a dot a case, its mean over seeds, filled "
+    "where it led beyond what was taught. Crosses above are lost: they diverged or are off by more than "
+    "1,000 %."
 )
 def error_over_parameters(view: View) -> Figures:
     """Errors over each parameter of each body, a panel each."""
@@ -58,7 +56,7 @@ def error_over_parameters(view: View) -> Figures:
         lost = 0  # rows of crosses
         for variant, rows in part.groupby("variant", sort=False):
             lost += _crosses(panel, rows[name][rows["lost"]], drawn[variant]["color"], lost)
-            _neighbours(panel, rows, name, drawn[variant], name in view.logarithmic)
+            _dots(panel, rows, name, drawn[variant])
         panel.set_title(body, pad=14 + 9 * max(0, lost - 1))
         panel.set(ylabel=ERROR)
         _scaled(panel, "x", part, name, name in view.logarithmic)
@@ -151,24 +149,12 @@ def _crosses(panel, at: pd.Series, color: str, row: int) -> bool:
     return True
 
 
-def _neighbours(panel, rows: pd.DataFrame, name: str, style: dict, log: bool) -> None:
-    """Dots of one variant [%], and their means over neighbours where they are enough."""
+def _dots(panel, rows: pd.DataFrame, name: str, style: dict) -> None:
+    """Errors of one variant [%] over a parameter, filled where a case led beyond what was taught."""
     dots = {"ls": "", "ms": 4.5, "mew": 1.1, "alpha": 0.9, "color": style["color"], "marker": style["marker"]}
-    few, shown = len(rows) < _FEWEST, rows[~rows["lost"]]
-    for beyond, part in shown.groupby("beyond"):
-        label = {"label": style["label"]} if few and not beyond else {}
-        face = style["color"] if beyond else "white"
-        panel.plot(part[name], 100 * part["error"], mfc=face, **dots, **label)
-    if few:
-        return
-    errors = 100 * rows["error"].mask(rows["lost"]).groupby(rows[name]).agg(whole_mean)  # a gap, in no mean
-    several = math.ceil(math.sqrt(len(errors))) + 1
-    places, near = (
-        np.lib.stride_tricks.sliding_window_view(v, several)
-        for v in (errors.index.to_numpy(float), errors.to_numpy(float))
-    )
-    middle = np.exp(np.log(places).mean(1)) if log else places.mean(1)
-    band(panel, middle, near.mean(1), near.min(1), near.max(1), **line(style))
+    for beyond, part in rows[~rows["lost"]].groupby("beyond"):
+        shown = {"mfc": style["color"]} if beyond else {"mfc": "white", "label": style["label"]}
+        panel.plot(part[name], 100 * part["error"], **shown, **dots)
 
 
 def _map(panel, view: View, cases: pd.DataFrame, names: list[str], scale: ScalarMappable) -> None:
