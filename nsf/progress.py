@@ -39,7 +39,7 @@ class Progress:
     def __init__(self, stage: str, total: int, unit: str):
         self._unit, self._total, self._done, self._what = unit, total, 0, stage
         self._logged = not sys.stderr.isatty()
-        self._began = self._told = time.monotonic()
+        self._told, self._first = time.monotonic(), None  # (time, done) after the first work, which compiles
         self._bar = RichProgress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -70,14 +70,14 @@ class Progress:
         """Count work done."""
         self._bar.advance(self._task, amount)
         self._done += amount
-        if self._logged and (now := time.monotonic()) - self._told >= EVERY:
-            self._told, rate = now, self._done / (now - self._began)
-            left = f", {max(0, self._total - self._done) / rate:.0f} s left" if rate else ""
-            print(
-                f"{label()}{self._what}, {self._done:,} of {self._total:,} {self._unit}, {rate:,.1f}/s{left}",
-                file=sys.stderr,
-                flush=True,
-            )
+        now = time.monotonic()
+        self._first = self._first or (now, self._done)
+        if self._logged and now - self._told >= EVERY:
+            self._told, begun, before = now, *self._first
+            rate = (self._done - before) / (now - begun) if self._done > before else 0.0
+            left = f", {rate:,.1f}/s, {max(0, self._total - self._done) / rate:.0f} s left" if rate else ""
+            line = f"{self._what}, {self._done:,} of {self._total:,} {self._unit}{left}"
+            print(f"{label()}{line}", file=sys.stderr, flush=True)
 
 
 _SECONDS: dict[str, float] = {}  # of this process's stages

@@ -51,7 +51,8 @@ def _error(row: pd.Series, frame: pd.DataFrame) -> str:
         return f"{row['diverged']} of {row['cases']} runs diverged"
     mean, worst = (number(row[name], 100) for name in ("displacement_error", "displacement_worst"))
     cases = f"{row['cases']} {' and '.join(frame['split'].unique())} runs"
-    return f"{mean} % of the displacement, the mean of {cases}; largest {worst} %"
+    stress = "" if math.isnan(row["stress_error"]) else f"; stress {number(row['stress_error'], 100)} % off"
+    return f"{mean} % of the displacement, the mean of {cases}; largest {worst} %{stress}"
 
 
 def _bound(frame: pd.DataFrame) -> str:
@@ -61,7 +62,8 @@ def _bound(frame: pd.DataFrame) -> str:
     ends = " to ".join(dict.fromkeys(number(end, 100) for end in (bounds.min(), bounds.max())))
     held = int((frame["displacement_error"] <= bounds).sum())
     flags = ", ".join(f"{count} {flag}" for flag, count in frame["flag"].value_counts().items() if flag)
-    return f"{ends} %, held by {held} of {len(frame)} runs{flags and f'; {flags}'}"
+    lights = f"; {flags} (at most half of trust.limit)" if "green" in flags else f"; {flags}" if flags else ""
+    return f"{ends} %, held by {held} of {len(frame)} runs{lights}"
 
 
 def _rivals(row: pd.Series) -> str:

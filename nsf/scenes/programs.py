@@ -19,7 +19,7 @@ from nsf.vectors import direction, numbers
 #: Keyframes between two knots of a program.
 _KEYFRAMES = 8
 #: Keyframes of a curve; curves of which its reach is the most, and how much further it is taken to go.
-_OF_CURVE, _TRIED, _SPARE = 101, 64, 1.02
+_OF_CURVE, _TRIED, _SPARE = 101, 64, 1.05
 #: Draws numbers, as `numpy.random.Generator.uniform(low, high)` does.
 Draw = Callable[..., float]
 
@@ -68,13 +68,17 @@ class GravityCurve(GravityProgram):
         return self._drawn(gravity, duration, generator.uniform)
 
     def reach(self, gravity: np.ndarray, duration: float) -> float:
-        """See `GravityProgram.reach`: the most of drawn curves, half of them of ends of ranges, and a bit."""
+        """See `GravityProgram.reach`: the most of drawn curves, also at ends of ranges, and a bit."""
         base, generator, far = Gravity.constant(gravity), np.random.default_rng(0), 0.0
 
         def end(low=0.0, high=1.0, size=None):
             return np.where(generator.random(size) < 0.5, low, high)[()]
 
-        for draw in (generator.uniform, end):
+        def either(low=0.0, high=1.0, size=None):
+            drawn = generator.uniform(low, high, size)
+            return np.where(generator.random(size) < 0.5, end(low, high, size), drawn)[()]
+
+        for draw in (generator.uniform, end, either):
             for _ in range(_TRIED):
                 values = np.asarray(self._drawn(base, duration, draw).values)
                 far = max(far, float(np.linalg.norm(values - gravity, axis=1).max()))

@@ -10,15 +10,15 @@ from nsf.scenes import GravityCurve
 
 @dataclass(frozen=True)
 class Law(IsotropicHardening):
-    """Voce hardening, from `yield_stress` to 1 + `gain` times it; `E` and `nu` are inherited."""
+    """Voce hardening, from `yield_stress` to 1 + `gain` times it. Only `E` and `nu` are fixed names."""
 
     yield_stress: float  # [Pa]
     gain: float = 4.0
-    rate: float = 20.0
+    rate: float = 25.0
 
-    def flow_stress(self, gamma):
-        """Largest ‖dev τ‖ [Pa] at the plastic strain `gamma`."""
-        return self.yield_stress * (1.0 + self.gain * (1.0 - math.exp(-self.rate * gamma)))
+    def flow_stress(self, p):
+        """Stress of a tensile test [Pa] at the equivalent plastic strain `p`."""
+        return self.yield_stress * (1.0 + self.gain * (1.0 - math.exp(-self.rate * p)))
 
 
 class Program(GravityCurve):

@@ -280,26 +280,30 @@ class Linear(IsotropicHardening):
     yield_stress: float
     slope: float
 
-    def flow_stress(self, gamma):
-        return max(self.yield_stress + self.slope * math.pow(gamma, type(gamma)(1.0)), self.yield_stress)
+    def flow_stress(self, p):
+        return max(self.yield_stress + self.slope * math.pow(p, type(p)(1.0)), self.yield_stress)
 
 
 RATIO = 2
+TENSION = math.sqrt(1.5)  # uniaxial stress over its ‖dev τ‖
 
 
 @dataclass(frozen=True)
 class WithNumbers(Linear):
-    def flow_stress(self, gamma: float) -> float:
-        least = type(gamma)(0.0)
-        return self.yield_stress + max(self.slope * gamma * math.pi * 0.5 / (math.pi / RATIO), least)
+    def flow_stress(self, p: float) -> float:
+        least = type(p)(0.0)
+        return self.yield_stress + max(self.slope * p * math.pi * 0.5 / (math.pi / RATIO), least)
 
 
 @pytest.mark.parametrize("law", [Linear, WithNumbers])
 @pytest.mark.parametrize(("precision", "rtol"), [("fp64", 1e-12), ("fp32", 1e-3)])
 def test_flow_stress_of_plastic_strain(law, precision, rtol):
-    """A linear one is linear hardening, whatever the path."""
+    """A linear one is linear hardening, whatever the path; σ = √1.5 ‖dev τ‖ and p = √(2/3) γ."""
     _, F = deformation_path("cyclic_shear", 0.2, 201)
-    laws = law(E, NU, TAU_Y, 2.0 * MU * 0.15), VonMisesHardening(E, NU, TAU_Y, hardening=0.15)
+    laws = (
+        law(E, NU, TENSION * TAU_Y, TENSION**2 * 2.0 * MU * 0.15),
+        VonMisesHardening(E, NU, TAU_Y, hardening=0.15),
+    )
     tau, expected = (drive(law, F, dt=1e-3, precision=precision_of(precision)) for law in laws)
     np.testing.assert_allclose(tau, expected, rtol=rtol, atol=rtol * TAU_Y)
 
@@ -310,8 +314,8 @@ class Voce(IsotropicHardening):
     saturation: float
     rate: float = 20.0
 
-    def flow_stress(self, gamma):
-        return self.saturation + (self.yield_stress - self.saturation) * math.exp(-self.rate * gamma)
+    def flow_stress(self, p):
+        return self.saturation + (self.yield_stress - self.saturation) * math.exp(-self.rate * p)
 
 
 def sheared(norms):
@@ -324,20 +328,23 @@ def sheared(norms):
 def test_history_from_the_stress_holds_it():
     """The flow stress is ‖dev τ‖ where the law reaches it, else its largest: at rest where it softens."""
     norms = TAU_Y * np.array([0.0, 0.5, 1.0 + 1e-6, 1.3, 1.99])
-    linear, reference = Linear(E, NU, TAU_Y, 1e5), VonMisesHardening(E, NU, TAU_Y, hardening=0.15)
-    stresses = [[linear.flow_stress(gamma)] for gamma in linear.history_of(sheared(norms))[:, 0]]
+    linear, reference = Linear(E, NU, TENSION * TAU_Y, 1e5), VonMisesHardening(E, NU, TAU_Y, hardening=0.15)
+    strains = linear.history_of(sheared(norms))[:, 0] / TENSION
+    stresses = [[linear.flow_stress(p) / TENSION] for p in strains]
     np.testing.assert_allclose(stresses, reference.history_of(sheared(norms)), rtol=1e-9)
-    voce = Voce(E, NU, TAU_Y, 2.0 * TAU_Y)
+    voce = Voce(E, NU, TENSION * TAU_Y, 2.0 * TENSION * TAU_Y)
     gammas = voce.history_of(sheared([*norms, 3.0 * TAU_Y]))[:, 0]
     expected = [*np.maximum(norms, TAU_Y), 2.0 * TAU_Y]
-    np.testing.assert_allclose([voce.flow_stress(gamma) for gamma in gammas], expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        [voce.flow_stress(gamma / TENSION) / TENSION for gamma in gammas], expected, rtol=1e-9
+    )
     assert not gammas[:2].any()
-    assert not Voce(E, NU, TAU_Y, 0.5 * TAU_Y).history_of(sheared(norms)).any()
+    assert not Voce(E, NU, TENSION * TAU_Y, 0.5 * TAU_Y).history_of(sheared(norms)).any()
 
 
 def test_hardened_particle_keeps_its_stress_when_taken_up(material_points):
     """A step at rest from a stress above the flow stress at rest leaves it."""
-    voce, tau = Voce(E, NU, TAU_Y, 2.0 * TAU_Y), sheared([1.5 * TAU_Y])
+    voce, tau = Voce(E, NU, TENSION * TAU_Y, 2.0 * TENSION * TAU_Y), sheared([1.5 * TAU_Y])
     start, _ = stressed(voce, tau, np.array([MU]), np.array([LAM]))
     points = material_points(voce, 1)
     points.F_e, points.history = start["F_e"], start["history"]
@@ -346,32 +353,32 @@ def test_hardened_particle_keeps_its_stress_when_taken_up(material_points):
 
 @dataclass(frozen=True)
 class NotAField(Linear):
-    def flow_stress(self, gamma):
-        return self.yield_stress + self.mu * gamma
+    def flow_stress(self, p):
+        return self.yield_stress + self.mu * p
 
 
 @dataclass(frozen=True)
 class Super(Linear):
-    def flow_stress(self, gamma):
-        return super().flow_stress(gamma)
+    def flow_stress(self, p):
+        return super().flow_stress(p)
 
 
 @dataclass(frozen=True)
 class Unnamed(Linear):
-    def flow_stress(self, gamma):
-        return self.yield_stress + wrong(gamma)  # noqa: F821
+    def flow_stress(self, p):
+        return self.yield_stress + wrong(p)  # noqa: F821
 
 
 @dataclass(frozen=True)
 class Argument(Linear):
-    def flow_stress(gamma):
-        return gamma
+    def flow_stress(p):
+        return p
 
 
 TYPED = """
 class Typed(Linear):
-    def flow_stress(self, gamma):
-        return self.yield_stress + self.slope * gamma
+    def flow_stress(self, p):
+        return self.yield_stress + self.slope * p
 """
 
 
@@ -386,7 +393,7 @@ def typed_in_an_interpreter(*values):
     [
         (NotAField, 0.0, "self.mu, which is no field"),
         (Super, 0.0, "write the whole formula"),
-        (Argument, 0.0, r"def flow_stress\(self, gamma\)"),
+        (Argument, 0.0, r"def flow_stress\(self, p\)"),
         (Unnamed, 0.0, "raises NameError: .*'wrong'"),
         (Linear, "2e5", "raises TypeError"),
         (typed_in_an_interpreter, 0.0, "write the class in a file"),

@@ -1,4 +1,4 @@
-"""Von Mises plasticity whose flow stress is a function of the plastic strain."""
+"""Von Mises plasticity whose flow stress is a function of the equivalent plastic strain."""
 
 import ast
 import hashlib
@@ -19,7 +19,9 @@ from nsf.mpm.materials.hencky import hencky_stretches, hencky_tau
 from nsf.mpm.materials.von_mises import deviator_norm, von_mises_update
 from nsf.mpm.precision import Precision
 
-#: [-] plastic strains at which a flow stress is checked.
+#: ‖dev τ‖ of a tensile stress, and equivalent plastic strain of γ: √(2/3) of it.
+_TENSILE = math.sqrt(2.0 / 3.0)
+#: [-] equivalent plastic strains at which a flow stress is checked.
 _CHECKED = (0.0, *np.geomspace(1e-4, 10.0, 51).tolist())
 _HALVINGS = 30  # of the bracket between two of these, down to 3e-10 of the larger
 
@@ -32,10 +34,11 @@ def _functions(law: type, precision: Precision) -> LawFunctions:
     constants = {"__annotations__": {field.name: real for field in fields(law)}, "__module__": law.__module__}
     Params = wp.struct(type(f"{law.__name__}Params", (), constants))
     flow_stress = wp.func(_typed(law.flow_stress, Params, real))
+    tensile = real(_TENSILE)
 
     @wp.func
     def bound(gamma: real, params: Params):
-        return flow_stress(params, gamma)
+        return tensile * flow_stress(params, tensile * gamma)
 
     @wp.func
     def strained(gamma: real, flowed: real, mu: real, params: Params):
@@ -69,7 +72,7 @@ def _check_text(law: type) -> None:
     name = f"{law.__name__}.flow_stress"
     method = law.flow_stress
     if not inspect.isfunction(method) or method.__code__.co_argcount != 2 or method.__name__ == "<lambda>":
-        raise ConfigError(f"{name} must be a plain method; write def flow_stress(self, gamma)")
+        raise ConfigError(f"{name} must be a plain method; write def flow_stress(self, p)")
     if method.__code__.co_freevars:
         raise ConfigError(
             f"{name} uses super(), a decorator or a name of an enclosing function, which no run can compile; "
@@ -99,20 +102,20 @@ def _check_fields(law: type, tree: ast.AST) -> None:
 
 
 class _Typed(ast.NodeTransformer):
-    """Gives numbers and constants of modules the type of γ: Warp would take them for fp32 and int."""
+    """Gives numbers and constants of modules the type of p: Warp would take them for fp32 and int."""
 
     def __init__(self, method: FunctionType):
         names = method.__code__.co_varnames
-        self._gamma = names[1]
+        self._strain = names[1]
         self._constants = {key: value for key, value in method.__globals__.items() if key not in names}
 
     def visit(self, node: ast.AST) -> ast.AST:
-        """The node, or its number as `type(gamma)(number)`."""
+        """The node, or its number as `type(p)(number)`."""
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Call):
             return node  # has its type
         value = _value(node, self._constants)
         if isinstance(value, int | float) and not isinstance(value, bool):
-            return ast.parse(f"type({self._gamma})({float(value)!r})", mode="eval").body
+            return ast.parse(f"type({self._strain})({float(value)!r})", mode="eval").body
         return self.generic_visit(node)
 
 
@@ -130,14 +133,15 @@ def _value(node: ast.AST, constants: dict):
 
 @dataclass(frozen=True)
 class IsotropicHardening(Material):
-    """Solid whose ‖dev τ‖ is bounded by a flow stress of the plastic strain: any τ_Y = f(γ) in one method.
+    """Solid whose von Mises stress is bounded by a flow stress σ_Y = f(p) in one method.
 
-    A law derives from it, declares its constants as fields, and defines `flow_stress`, which takes plain
-    arithmetic and functions of `math` and is compiled for each precision. It inherits `E` and `nu`, and one
-    history variable a particle: γ, the sum of δγ = ‖dev ε‖ − τ_Y/(2μ) over its returns as in `VonMises`,
-    zero at rest. √(2/3) γ is the equivalent plastic strain, √1.5 τ_Y the yield stress in uniaxial stress.
+    A law derives from it, declares its constants as fields, and defines `flow_stress` as a tensile test has
+    it: σ_Y bounds √1.5 ‖dev τ‖, and p = √(2/3) γ is the equivalent plastic strain. It takes plain arithmetic
+    and functions of `math`, and is compiled for each precision. A law inherits `E` and `nu`, and one history
+    variable a particle: γ, the sum of δγ = ‖dev ε‖ − √(2/3) σ_Y/(2μ) over its returns as in `VonMises`, zero
+    at rest. The `yield_stress` of `VonMises` bounds ‖dev τ‖ itself.
 
-    Each return goes to the flow stress before the step, so that ‖dev τ‖ lags by one step.
+    Each return goes to the flow stress before the step, so that the stress lags by one step.
 
     Raises:
         ConfigError: a flow stress fails, is not positive and finite, or cannot be compiled.
@@ -146,10 +150,10 @@ class IsotropicHardening(Material):
     def __post_init__(self):
         super().__post_init__()
         _check_text(type(self))
-        for gamma in _CHECKED:
-            value = f"{type(self).__name__}.flow_stress({gamma:.3g})"
+        for p in _CHECKED:
+            value = f"{type(self).__name__}.flow_stress({p:.3g})"
             try:
-                stress = float(self.flow_stress(gamma))
+                stress = float(self.flow_stress(p))
             except Exception as error:
                 raise ConfigError(
                     f"{value} raises {type(error).__name__}: {first_line(error)}; it must be a positive "
@@ -159,8 +163,8 @@ class IsotropicHardening(Material):
                 raise ConfigError(f"{value}={stress} Pa must be positive and finite")
 
     @abstractmethod
-    def flow_stress(self, gamma: float) -> float:
-        """τ_Y [Pa], the largest ‖dev τ‖, at the accumulated plastic strain γ."""
+    def flow_stress(self, p: float) -> float:
+        """σ_Y [Pa], the stress of a tensile test that flows, at the equivalent plastic strain p."""
 
     def functions(self, precision: Precision) -> LawFunctions:
         """The law's Warp functions."""
@@ -171,28 +175,28 @@ class IsotropicHardening(Material):
         return hencky_stretches(principal, mu, lam)
 
     def history_of(self, tau: np.ndarray) -> np.ndarray:
-        """[P, 1] lower bound of γ: the least whose flow stress holds ‖dev τ‖, zero up to that at rest.
+        """[P, 1] lower bound of γ: the least whose flow stress holds τ, zero up to that at rest.
 
-        By bisection between the checked strains. Where no flow stress holds ‖dev τ‖, because the law softens
+        By bisection between the checked strains. Where no flow stress holds τ, because the law softens
         or saturates below it, γ is that of the largest, and the next return goes to it. As in
         `VonMisesHardening`, the bound misses the hardening of a particle that has unloaded since.
 
         Args:
             tau: [P, 3, 3] Kirchhoff stress [Pa].
         """
-        carried, strains = deviator_norm(tau), np.array(_CHECKED)
+        carried, strains = deviator_norm(tau) / _TENSILE, np.array(_CHECKED)
         stresses = self._flow_stresses(strains)
         upper = np.searchsorted(np.maximum.accumulate(stresses), carried)
         upper = np.minimum(upper, stresses.argmax())
-        gamma, hardened = strains[upper], upper > 0
-        low, high, carried = strains[upper[hardened] - 1], gamma[hardened], carried[hardened]
+        p, hardened = strains[upper], upper > 0
+        low, high, carried = strains[upper[hardened] - 1], p[hardened], carried[hardened]
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
             holds = self._flow_stresses(middle) >= carried
             low, high = np.where(holds, low, middle), np.where(holds, middle, high)
-        gamma[hardened] = high
-        return gamma[:, None]
+        p[hardened] = high
+        return p[:, None] / _TENSILE
 
-    def _flow_stresses(self, gamma: np.ndarray) -> np.ndarray:
+    def _flow_stresses(self, p: np.ndarray) -> np.ndarray:
         """[n] flow stresses [Pa] at plastic strains [n]; one by one, as `flow_stress` takes numbers."""
-        return np.array([self.flow_stress(value) for value in gamma.tolist()], float)
+        return np.array([self.flow_stress(value) for value in p.tolist()], float)

@@ -78,8 +78,9 @@ def deploy_held_out(pipeline, run: Run) -> None:
                 truth = pipeline.truth(rollout.case).file(TRAJECTORY)
                 shutil.copyfile(truth, record.path / continuation_file(index))
                 record.output(continuation_file(index))
+        validating = pipeline.config.deploy.split == "validation"
         for line in _lines(rollouts):
-            pipeline.say(f"deploy: {line}")
+            pipeline.say(f"deploy: {'validation: ' * validating}{line}")
         write_configuration(pipeline, record)
         flags, bound = zip(*((r.verdict.flag, r.verdict.bound_share) for r in rollouts), strict=True)
         record.metrics["seconds"] = [r.seconds for r in rollouts]
@@ -90,7 +91,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
         lights = ", ".join(f"{flags.count(flag)} {flag}" for flag in FLAGS if flag in flags)
         most = "" if np.isnan(bound).all() else f": ≤ {percent(np.nanmax(bound))}"
         record.metrics["light"] = lights + most
-    together, validating = record.metrics["batch"], pipeline.config.deploy.split == "validation"
+    together = record.metrics["batch"]
     at_once = f", {together} together" if together > 1 else ""
     pipeline.say(
         f"deploy: model={pipeline.model.name}, |S|={rollouts[0].sample}, "

@@ -6,9 +6,9 @@ from PROJECT import Law
 
 
 def test_sheared_body_carries_its_flow_stress():
-    law = Law(E=4000.0, nu=0.3, yield_stress=40.0)
+    law = Law(E=4000.0, nu=0.3, yield_stress=50.0)
     _, F = deformation_path("simple_shear", 1.0, 2001)
     tau = drive(law, F, dt=1e-3)[-1]
-    carried = np.linalg.norm(tau - np.trace(tau) / 3.0 * np.eye(3))
-    stresses = [law.flow_stress(gamma) for gamma in np.linspace(0.0, 1.0, 101).tolist()]
+    carried = np.sqrt(1.5) * np.linalg.norm(tau - np.trace(tau) / 3.0 * np.eye(3))  # von Mises stress
+    stresses = [law.flow_stress(p) for p in np.linspace(0.0, 1.0, 101).tolist()]
     assert 0.99 * min(stresses) <= carried <= 1.01 * max(stresses)
