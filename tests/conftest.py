@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import pickle
 import shutil
 import signal
 from dataclasses import dataclass
@@ -73,6 +74,33 @@ def unflushed_files():
     """Files of tests need not survive the machine: waiting for the disk takes a fifth of a chain's time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nsf.storage._flush", lambda path: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def files_parsed_once():
+    """Hydra parses its yamls and those of `conf/` anew for each choice of options, a third of that time."""
+    from hydra._internal.sources_registry import SourcesRegistry
+    from hydra.core.plugins import Plugins
+
+    Plugins.instance()  # which registers the sources
+    parsed = {}
+
+    def once(plain):
+        def load(source, config_path):
+            path = Path(source.path, source._normalize_file_name(config_path))
+            stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
+            key = path, stamp, source.provider
+            if key not in parsed:
+                parsed[key] = pickle.dumps(plain(source, config_path))
+            return pickle.loads(parsed[key])
+
+        return load
+
+    with pytest.MonkeyPatch.context() as patch:
+        for scheme in ("file", "pkg"):
+            kind = SourcesRegistry.instance().resolve(scheme)
+            patch.setattr(kind, "load_config", once(kind.load_config))
         yield
 
 
