@@ -56,7 +56,7 @@ def test_its_groups_and_experiments_come_first(folder, monkeypatch, capsys, how)
     assert all(value in text for value in ("name: dune", "steps: 3", "shape: cubic"))
     assert {"dune", "sand"} <= set(paths.groups()["scene"])
     assert [job.overrides for job in Experiment.load("dunes").jobs] == [("scene=dune",)]
-    assert config.jobs([["scene=glob(d*)"]]) == [("scene=drop",), ("scene=dune",)]
+    assert {("scene=drop",), ("scene=dune",)} <= set(config.jobs([["scene=glob(d*)"]]))
     assert config.load(["model=auto"]).transfer.shape == "cubic"
 
 
