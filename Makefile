@@ -109,6 +109,7 @@ reproduce: install  ## every report, from nothing, on one GPU; the same command 
 		[ -z "$$failed" ] || { echo "not whole:$$failed; make reproduce goes on" >&2; exit 1; }
 	NSF_RUNS=$${NSF_RUNS:-runs}-calibration $(MAKE) calibration
 	$(BIN)/nsf bench
+	$(BIN)/nsf validate
 	$(BIN)/nsf reports folder=reports
 	$(BIN)/nsf reports folder=reports check=true
 
