@@ -14,7 +14,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 def test_readme_links_lead_somewhere():
     links = re.findall(r"\]\(([^)]+)\)", README) + re.findall(r'(?:href|src)="([^"]+)"', README)
-    links = [link for link in links if not link.startswith(("http", "#"))]
+    links = [link.partition("#")[0] for link in links if not link.startswith(("http", "#"))]
     named = re.findall(r"`((?:nsf|conf|docs|experiments)/[\w/.]+)`", README)
     assert links
     for path in (*links, *named):
@@ -26,8 +26,7 @@ def test_readme_figures_are_those_of_the_reports():
 
 
 def test_readme_is_short():
-    generated = README[README.index(BEGIN) : README.index(END)]
-    assert len(README.replace(generated, "").split()) <= 620
+    assert len(README.split()) <= 700
 
 
 def test_figures_need_their_markers():
