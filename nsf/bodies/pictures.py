@@ -61,7 +61,7 @@ class Stage:
 
     def __init__(self, bodies: Sequence[Body], cut: bool = False, shown: Sequence[int] | None = None):
         self._solids = {id(body): Solids(body.around, body.x[0].mean(axis=0, dtype=float)) for body in bodies}
-        self._radius = {id(body): body.radius or _radius(body.x[0]) for body in bodies}
+        self._radius = {id(body): body.radius or closed_radius(body.x[0]) for body in bodies}
         frames = [
             (body, k) for body in bodies for k in (spaced(len(body.x), _LOOKS) if shown is None else shown)
         ]
@@ -175,7 +175,7 @@ def is_cut_open(X: np.ndarray) -> bool:
 
 def hides_inside(X: np.ndarray, x: np.ndarray, values: np.ndarray) -> bool:
     """Whether values [n] lie within a body x [n, 3], X at rest: its surface carries little of them."""
-    front = View.around(x, 100).front(x, _radius(X))
+    front = View.around(x, 100).front(x, closed_radius(X))
     return is_cut_open(X) and bool(values[front].mean() < _INSIDE * values.mean())
 
 
@@ -201,7 +201,7 @@ def _laid_over(picture: np.ndarray, over: np.ndarray, opacity: float) -> np.ndar
     return np.where((over < _WHITE).any(axis=-1, keepdims=True), mixed, picture).astype(np.uint8)
 
 
-def _radius(X: np.ndarray) -> float:
+def closed_radius(X: np.ndarray) -> float:
     """A ball's radius [m] at which points X [n, 3] look closed: from how near their neighbours are."""
     some = drawn(len(X), _NEIGHBOURS)
     reach = cKDTree(X).query(X[some], min(9, len(X)))[0][:, -1]

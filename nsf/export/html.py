@@ -7,10 +7,14 @@ import numpy as np
 from nsf.errors import ConfigError
 from nsf.export.playback import QUANTITIES, Playback
 from nsf.live import page
+from nsf.live.surface import surface
 from nsf.storage import write_text
+from nsf.vectors import spaced
 
 NEEDS = ()
 POINTS = 20_000  # by default: a page of some MiB that a telephone plays
+_CLOSED = 0.72  # radius at which points look closed, over the edge of the cube that each of them fills
+_LOOKS = 16  # frames by which it is told whether a body is drawn as a surface
 LARGEST = 1 << 29  # bytes of positions and colours that a browser unpacks
 
 
@@ -55,5 +59,7 @@ def write(playback: Playback, folder: Path) -> Path:
         "solids": playback.solids,
         "recordings": {"run": recorded},
     }
-    data = page.packed(header, {f"run.{name}": array for name, array in arrays.items()})
+    shown = x[1:][spaced(F, _LOOKS)]
+    arrays = {f"run.{name}": array for name, array in arrays.items()}
+    data = page.packed(header, arrays | surface(x[0], playback.radius / _CLOSED, shown))
     return write_text(folder / f"{playback.name}.html", page.html(playback.title, data))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from nsf import config as configuration
+from nsf.bodies import closed_radius
 from nsf.bodies.colors import CLIP
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
@@ -235,9 +236,8 @@ class Playback:
 
     @property
     def radius(self) -> float:
-        """Radius [m] of spheres at which the points look closed, from the volume that they fill at rest."""
-        extent = np.maximum(np.ptp(self.X, axis=0), 1e-6)
-        return float(0.62 * (np.prod(extent) / len(self.X)) ** (1 / 3))
+        """Radius [m] of spheres at which the points look closed at rest."""
+        return closed_radius(self.X)
 
     def thinned(self, points: int) -> "Playback":
         """The same frames at `points` of the particles, or at all particles if there are fewer."""

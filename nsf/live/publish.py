@@ -93,8 +93,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
     taught, stress = recurrence.taught, recurrence.form.sizes.stress
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]
-    arrays = {"rest": model.X}
-    corners = _surface(model, arrays)
+    arrays = {"rest": model.X} | surface(model.X, model.spacing, model.training_frames[0])
     header["fields"] = _fields(model, arrays, header, sizes, stress)
     arrays |= recurrence_arrays(recurrence.form)
     batch = pipeline.batch_at(model.manifold, [model.initial], precision="fp64")
@@ -110,7 +109,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
         "recordings": {},
     }  # fmt: skip
     header["first"] = _surest(model)
-    header["cases"] = _cases(model, taught.parameters, arrays, header, sizes, corners)
+    header["cases"] = _cases(model, taught.parameters, arrays, header, sizes)
     return model.title, page.packed(header, arrays)
 
 
@@ -160,15 +159,6 @@ def recurrence_arrays(form: Form) -> dict[str, np.ndarray]:
                 arrays[f"{name}{member}.weight{k}"] = weight[member].T.contiguous().float().numpy()
                 arrays[f"{name}{member}.bias{k}"] = bias[member].contiguous().float().numpy()
     return arrays
-
-
-def _surface(model: LiveModel, arrays: dict) -> np.ndarray | None:
-    """Put the surface of a body that has one into a page; gives the rows of its corners."""
-    found = surface(model.X, model.spacing, model.training_frames[0])
-    if found is None:
-        return None
-    arrays |= {"corners": found[0].astype(np.uint16), "faces": found[1].astype(np.uint16)}
-    return found[0]
 
 
 def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes, stress: int) -> dict:
@@ -233,9 +223,7 @@ def _tilt(model: LiveModel, recurrence: RecurrenceEngine) -> dict | None:
     return {"down": down.tolist(), "angle": max(angle, _LEAST_TILT)}
 
 
-def _cases(
-    model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes, corners: np.ndarray | None
-) -> list[dict]:
+def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) -> list[dict]:
     """The held-out cases: their parameters, forcing, and the full-order runs of some."""
     pipeline, entries, movable, first = model.pipeline, [], _movable(model), header["first"]
     stored = [case for case in (pipeline.held_out[first], *pipeline.held_out) if case in model.simulated]
@@ -251,7 +239,7 @@ def _cases(
         }  # fmt: skip
         if case in stored:
             entry["recording"] = f"full{index}"
-            recording, planes = _recorded(model, case, header["quantities"], sizes, corners)
+            recording, planes = _recorded(model, case, header["quantities"], sizes, arrays.get("corners"))
             header["recordings"][entry["recording"]] = recording
             arrays |= {f"{entry['recording']}.{name}": a for name, a in planes.items()}
         entries.append(entry)

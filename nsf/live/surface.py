@@ -10,8 +10,8 @@ _STRETCH = 2.0
 _SHARE = 99.5  # [%] percentile of the stretch that counts
 
 
-def surface(X: np.ndarray, spacing: float, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Corners and triangles of the surface of a body; None where it flows or tears, or has too many points.
+def surface(X: np.ndarray, spacing: float, frames: np.ndarray) -> dict[str, np.ndarray]:
+    """The surface of a body, as a page has it; nothing where it flows or tears, or has too many points.
 
     Args:
         X: [n, 3] points at rest [m].
@@ -19,23 +19,23 @@ def surface(X: np.ndarray, spacing: float, frames: np.ndarray) -> tuple[np.ndarr
         frames: [F, n, 3] the points as they move [m].
 
     Returns:
-        Rows [V] of X, and triangles [m, 3] between them, anticlockwise as seen from outside.
+        `corners`: rows [V] of X; `faces`: triangles [m, 3] of these, anticlockwise as seen from outside.
 
     Source: the boundary of the alpha complex, Edelsbrunner and Mücke 1994.
     """
     if not 4 < len(X) <= _MOST:
-        return None
+        return {}
     faces = boundary(X.astype(float), _ALPHA * spacing)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     if not len(edges):
-        return None
+        return {}
     rest, lengths = (
         np.linalg.norm(x[..., edges[:, 0], :] - x[..., edges[:, 1], :], axis=-1) for x in (X, frames)
     )
     if np.percentile(lengths / rest, _SHARE) > _STRETCH:
-        return None
+        return {}
     rows, corners = np.unique(faces, return_inverse=True)
-    return rows, corners.reshape(-1, 3)
+    return {"corners": rows.astype(np.uint16), "faces": corners.reshape(-1, 3).astype(np.uint16)}
 
 
 def boundary(X: np.ndarray, radius: float) -> np.ndarray:

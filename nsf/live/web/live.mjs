@@ -219,12 +219,12 @@ export class LivePlayer extends Live {
   place(drawing) {
     const { told } = this;
     this.drawing = drawing;
-    const { corners, faces } = this.arrays, surface = faces ? new Surface(corners, faces) : null;
+    const { corners, faces } = this.arrays;
     this.body = drawing.body(this.rest);
-    this.body.surface = surface;
+    this.body.surface = Surface.of(this.arrays);
     this.beside = drawing.camera.beside();
     for (const [name, own] of this.recordings) {
-      const outer = surface && own.points === corners.length;
+      const outer = corners && own.points === corners.length;
       const body = drawing.body(own.rest, this.beside, outer ? told.radius : told.radius * Math.cbrt(told.points / own.points));
       body.surface = outer ? new Surface(corners.map((_, row) => row), faces) : null;
       this.truths.set(name, body);

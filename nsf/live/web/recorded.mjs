@@ -3,6 +3,7 @@
 import { counted } from "./controls.mjs";
 import { Recording } from "./data.mjs";
 import { displacement } from "./field.mjs";
+import { Surface } from "./surface.mjs";
 
 /** Plays a recorded run; see `Player` in `page.mjs`. */
 export class RecordedPlayer {
@@ -11,6 +12,7 @@ export class RecordedPlayer {
     const told = packed.header, run = new Recording(packed, "run");
     const stopped = told.stopped === null ? "" : `; diverged at t = ${told.stopped.toPrecision(3)} s, shown up to there`;
     this.run = run;
+    this.arrays = packed.arrays;
     this.told = { ...told, lower: run.lower, upper: run.upper };
     this.about = `reduced run ${told.run}, ${counted(told.points, told.particles)}${stopped} · drag turns, shift-drag moves, the wheel zooms, a double click resets`;
     /** @type {string} */ this.color = told.color;
@@ -34,6 +36,7 @@ export class RecordedPlayer {
   /** @param {import("./drawing.mjs").Drawing} drawing */
   place(drawing) {
     this.body = drawing.body(this.run.rest);
+    this.body.surface = Surface.of(this.arrays);
     drawing.solids = this.told.solids;
   }
 

@@ -23,6 +23,11 @@ export class Surface {
     this._drawn = new Float32Array(7 * this.rows.length);
   }
 
+  /** That of a page, if it has one. @param {Record<string, any>} arrays @returns {Surface | null} */
+  static of({ corners, faces }) {
+    return faces ? new Surface(corners, faces) : null;
+  }
+
   /**
    * Corners [V, 7]: where they are [m], the normal, and the value; the next call overwrites them.
    * @param {Body} body

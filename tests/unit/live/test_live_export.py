@@ -163,15 +163,15 @@ def test_a_surface_closes_a_body_and_faces_outward():
     generator = np.random.default_rng(0)
     X = generator.random((2000, 3))
     still = np.stack([X, 1.5 * X])
-    rows, faces = surface(X, 2000 ** (-1 / 3), still)
+    rows, faces = surface(X, 2000 ** (-1 / 3), still).values()
     corners = X[rows][faces]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     assert set(np.unique(edges, axis=0, return_counts=True)[1]) <= {2, 4}
     volume = np.linalg.det(corners).sum() / 6
     assert 0.75 < volume < 1.0
     torn = still[1] + (X[:, :1] > 0.5) * np.array([2.0, 0.0, 0.0])
-    assert surface(X, 2000 ** (-1 / 3), np.stack([X, torn])) is None
-    assert surface(X[:4], 1.0, still[:, :4]) is None
+    assert surface(X, 2000 ** (-1 / 3), np.stack([X, torn])) == {}
+    assert surface(X[:4], 1.0, still[:, :4]) == {}
 
 
 def test_a_page_is_asked_for_as_other_formats_are(taught_model, tmp_path, capsys, monkeypatch):
