@@ -81,7 +81,8 @@ def test_strides_are_those_of_the_definition(text, kind):
     for found, expected in zip(text(made, *values), by_definition(made, *values), strict=True):
         if expected.numel():
             assert (expected[-1] - expected[0]).abs().max() > 0.01
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-11)
+        # Weights of a page are in single precision.
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-11 if text is by_loop else 1e-6)
 
 
 @kinds
