@@ -1,5 +1,6 @@
 """Problems with published answers (physics.md, section 4), as `nsf validate` runs them."""
 
+import itertools
 from importlib import import_module
 
 import pandas as pd
@@ -10,35 +11,30 @@ from nsf.results.folder import read
 from nsf.validation import validate
 from nsf.validation.problem import Answer
 
-SLOW = pytest.mark.slow
-#: Keys of the scene and, by quantity, how far off [%] it may be; the committed report has the full sizes.
+SLOW = {"marks": pytest.mark.slow}
+#: By problem, how far off [%] a quantity may be.
 CASES = [
-    pytest.param("incline", [], {"way in 0.3 s": 1.0}, id="incline"),
+    pytest.param("incline", {"way in 0.3 s": 1.0}, id="incline"),
     pytest.param(
         "discs",
-        ["scene.dx=0.04", "scene.dt=0.02", "scene.steps=210"],
         {"kinetic energy before": 0.1, "momentum over a disc's": 1e-9, "rise of total energy": 0.1},
         id="discs",
-        marks=SLOW,
+        **SLOW,
     ),
-    pytest.param("settling", [], {"stress over ρ₀ g (l₀ − y₀), slope": 2.0}, id="settling", marks=SLOW),
-    pytest.param("taylor_bar", [], {"final radius of the foot": 2.0}, id="taylor_bar", marks=SLOW),
+    pytest.param("settling", {"stress over ρ₀ g (l₀ − y₀), slope": 2.0}, id="settling", **SLOW),
+    pytest.param("taylor_bar", {"final radius of the foot": 2.0}, id="taylor_bar", **SLOW),
     pytest.param(
-        "cantilever",
-        [],
-        {f"w/L at P L²/EI = {ratio}": 2.0 for ratio in (1, 2, 5, 10)} | {"u/L at P L²/EI = 1": 1.0},
-        id="cantilever",
-        marks=SLOW,
+        "cantilever", {"w/L at P L²/EI = 1": 1.0, "u/L at P L²/EI = 1": 1.0}, id="cantilever", **SLOW
     ),
 ]
 
 
-@pytest.mark.parametrize(("name", "keys", "bounds"), CASES)
-def test_answer_is_the_published_one(name, keys, bounds):
-    scene = nsf.load_scene(name, keys)
-    answers = {a.quantity: a for a in import_module(f"nsf.validation.{name}").answers(scene, "cpu")}
-    for quantity, bound in bounds.items():
-        assert abs(answers[quantity].difference) < bound, answers[quantity]
+@pytest.mark.parametrize(("name", "bounds"), CASES)
+def test_answer_is_the_published_one(name, bounds):
+    """The first answers of each problem, as far as its bounds name them."""
+    answers = import_module(f"nsf.validation.{name}").answers(nsf.load_scene(name), "cpu")
+    for answer in itertools.islice(answers, len(bounds)):
+        assert abs(answer.difference) < bounds[answer.quantity], answer
 
 
 def test_a_value_within_the_published_spread_is_not_off():
