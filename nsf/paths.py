@@ -29,9 +29,14 @@ def user_folders() -> tuple[Path, ...]:
     """The folders of `NSF_CONFIG`.
 
     Raises:
-        ConfigError: one is no folder, has no groups or a part of Hydra's, or two have the same file.
+        ConfigError: one is no folder, has no groups or a part of Hydra's, or two have the same file; or the
+            folder that one works in was deleted.
     """
-    return _checked(os.environ.get(VARIABLE, ""), os.getcwd())
+    try:
+        cwd = os.getcwd()
+    except FileNotFoundError as error:
+        raise ConfigError("the folder that you are in was deleted; change to another one") from error
+    return _checked(os.environ.get(VARIABLE, ""), cwd)
 
 
 @cache
