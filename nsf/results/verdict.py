@@ -62,8 +62,14 @@ def _bound(frame: pd.DataFrame) -> str:
     ends = " to ".join(dict.fromkeys(number(end, 100) for end in (bounds.min(), bounds.max())))
     held = int((frame["displacement_error"] <= bounds).sum())
     flags = ", ".join(f"{count} {flag}" for flag, count in frame["flag"].value_counts().items() if flag)
-    lights = f"; {flags} (at most half of trust.limit)" if "green" in flags else f"; {flags}" if flags else ""
-    return f"{ends} %, held by {held} of {len(frame)} runs{lights}"
+    lights = (
+        f"; {flags} (at most half of trust.limit, 10 % by default)"
+        if "green" in flags
+        else f"; {flags}"
+        if flags
+        else ""
+    )
+    return f"{ends} %, to hold in 90 % of runs, held by {held} of {len(frame)} runs{lights}"
 
 
 def _rivals(row: pd.Series) -> str:

@@ -283,6 +283,16 @@ def test_point_gives_the_laws_values(nsf, tmp_path):
     assert last["tau_xx"] == pytest.approx(7641.432412, rel=1e-9)
 
 
+def test_a_law_of_a_user_keeps_its_stiffness_at_a_point(nsf, tmp_path):
+    (tmp_path / "conf/material").mkdir(parents=True)
+    law = "_target_: nsf.mpm.materials.Hencky\nE: 1000.0\nnu: 0.3\n"
+    (tmp_path / "conf/material/soft.yaml").write_text(law)
+    said = [nsf("point", *words, tiny_scene=False)[1].splitlines()[0] for words in (
+        ("--config-dir", str(tmp_path / "conf"), "material=soft"), ("material=hencky", "material.E=1000"),
+    )]  # fmt: skip
+    assert said[0] == said[1]
+
+
 def test_extremes_of_a_point_are_those_of_the_whole_path(nsf):
     """A cyclic path ends where it began, with next to no stress."""
     _, out, _ = nsf("point", "material=hencky", "path=cyclic_shear", "point.points=21", tiny_scene=False)

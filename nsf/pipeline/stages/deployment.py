@@ -79,7 +79,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
                 shutil.copyfile(truth, record.path / continuation_file(index))
                 record.output(continuation_file(index))
         validating = pipeline.config.deploy.split == "validation"
-        for line in _lines(rollouts):
+        for line in _lines(rollouts, validating):
             pipeline.say(f"deploy: {'validation: ' * validating}{line}")
         write_configuration(pipeline, record)
         flags, bound = zip(*((r.verdict.flag, r.verdict.bound_share) for r in rollouts), strict=True)
@@ -183,14 +183,14 @@ def _full_order(pipeline, manifold: Manifold, cases: Sequence[Case], limit: floa
     return rollouts
 
 
-def _lines(rollouts: Sequence[Rollout]) -> list[str]:
+def _lines(rollouts: Sequence[Rollout], validating: bool) -> list[str]:
     """Lines for the user: whether runs are to be believed, green ones in one line, and what went wrong."""
     greens = [one.verdict for one in rollouts if one.verdict.flag == GREEN and not one.by]
     together = len(greens) > 1
     lines = [
         line
         for one in rollouts
-        for line in _of_run(one, light=not together or one.verdict.flag != GREEN or bool(one.by))
+        for line in _of_run(one, not together or one.verdict.flag != GREEN or bool(one.by), validating)
     ]
     if not together:
         return lines
@@ -200,11 +200,12 @@ def _lines(rollouts: Sequence[Rollout]) -> list[str]:
     return [f"{len(greens)} runs are green: {errors}", *lines]
 
 
-def _of_run(rollout: Rollout, light: bool) -> list[str]:
+def _of_run(rollout: Rollout, light: bool, validating: bool) -> list[str]:
     named = rollout.case.named
     by = f" by {rollout.by}" if rollout.by else ""
     light = light and rollout.verdict.reason != CALIBRATES
-    lines = [f"{named}{by}: {rollout.verdict.text}"] if light else []
+    aside = "; error bounds leave it out" * (validating and rollout.verdict.beyond)
+    lines = [f"{named}{by}: {rollout.verdict.text}{aside}"] if light else []
     if rollout.diverged >= 0:
         lines.append(
             f"warning: {named} diverged at step {rollout.diverged} (off the grid or not finite); "

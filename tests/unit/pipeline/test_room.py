@@ -26,7 +26,7 @@ def test_warnings_are_said_and_kept(pipeline_at, tmp_path):
     said = []
     keys = ("scene.bodies.column.particles=100", "scene.steps=2")
     runs = pipeline_at(tmp_path, *keys, say=said.append).simulate()
-    (line,) = [line for line in said if "a cell" in line]
+    (line,) = [line for line in said if "particles are" in line]
     assert line.startswith("simulate: warning: scene.bodies.column: 100 particles are 0.45 a cell")
     assert all(line.removeprefix("simulate: warning: ") in run.manifest["warnings"] for run in runs)
     said.clear()
