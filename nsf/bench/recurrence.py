@@ -13,6 +13,7 @@ from nsf.bench.rows import Case, Measurements
 from nsf.data import Case as Parameters
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedMPM
+from nsf.dynamics.interop import on_torch_stream
 from nsf.pipeline import Pipeline
 from nsf.recurrence import Loop, RecurrenceEngine, collider_states, first_change
 from nsf.recurrence.descent import of_strides
@@ -92,7 +93,7 @@ class Many:
         self._loop = Loop(form, mu, *acting, setup.precision, setup.device)
         stride = form.stride * setup.dt
         first = first_change(setup.manifold, setup.constants.X, setup.initial_velocity, stride)
-        self._first, self._stride = first.expand(len(mu), -1), form.stride
+        self._first, self._stride, self._device = first.expand(len(mu), -1), form.stride, setup.device
         self._start = form.begin(setup.xhat.double().cpu().expand(len(mu), -1), self._first)
         self.restart()
 
@@ -103,7 +104,8 @@ class Many:
 
     def step(self, n: int = 1) -> None:
         """Take steps of all runs, a multiple of the stride."""
-        self._loop.advance(self._done, n // self._stride)
+        with on_torch_stream(self._device):
+            self._loop.advance(self._done, n // self._stride)
         self._done += n // self._stride
 
     @property

@@ -4,7 +4,7 @@ import numpy as np
 
 #: Of a cell: a motion, and a change of shape, below which nothing happens.
 _STILL = 0.01
-STILL = "nothing moves by 1 % of a cell; set more scene.steps, or a larger load"
+STILL = "at the end nothing is 1 % of a cell from where it began; set more scene.steps, or a larger load"
 RIGID = "the body moves, and deforms by less than 1 % of a cell; set more scene.steps, or a larger load"
 FLAT = "the body ends flatter than a cell; give it a stiffer material or a smaller load"
 

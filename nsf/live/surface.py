@@ -32,7 +32,7 @@ def surface(X: np.ndarray, spacing: float, frames: np.ndarray) -> dict[str, np.n
     rest, lengths = (
         np.linalg.norm(x[..., edges[:, 0], :] - x[..., edges[:, 1], :], axis=-1) for x in (X, frames)
     )
-    if np.percentile(lengths / rest, _SHARE) > _STRETCH:
+    if not np.percentile(lengths / rest, _SHARE) <= _STRETCH:  # nor of a run that is lost
         return {}
     rows, corners = np.unique(faces, return_inverse=True)
     return {"corners": rows.astype(np.uint16), "faces": corners.reshape(-1, 3).astype(np.uint16)}

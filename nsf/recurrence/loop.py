@@ -222,14 +222,17 @@ class Loop:
         into = record.xhat, stress, record.before, record.now
         values = self.xhat, stresses, first.to(record.xhat).contiguous()
         inputs = [*map(shown, values), self.form.stride, *map(shown, into), shown(record.row), 0, 0]
+        begin_at, end_at = len(inputs) - 2, len(inputs) - 1
         launch = wp.launch(
             make_frames(self._precision), (self._count, 1, r + n_s), inputs, device=self._device,
             record_cmd=True,
         )  # fmt: skip
 
+        self._recorded = inputs  # the launch reads where they lie
+
         def write(begin: int, end: int) -> None:
             launch.set_dim((self._count, end - begin + 1, r + n_s))
-            for index, value in ((len(inputs) - 2, begin), (len(inputs) - 1, end)):
+            for index, value in ((begin_at, begin), (end_at, end)):
                 launch.set_param_at_index(index, value)
             launch.launch()
 

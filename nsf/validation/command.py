@@ -111,7 +111,7 @@ def chart(frame: pd.DataFrame) -> Figure:
         panel.axvline(0.0, color=INK, lw=0.8)
         panel.plot(frame["off"], at, "o", color=PALETTE[0])
         panel.set_xscale("symlog", linthresh=2.0)
-        panel.set_xlim(-60.0, 60.0)
+        panel.set_xlim(*(sign * max(60.0, 1.2 * frame["off"].abs().max()) for sign in (-1.0, 1.0)))
         panel.set_xticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
         panel.set(yticks=at, yticklabels=frame["problem"].str.replace("_", " ") + ": " + frame["quantity"])
         panel.set(xlabel="off [%]", ylim=(len(frame) - 0.5, -0.5))

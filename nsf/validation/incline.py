@@ -17,4 +17,6 @@ def answers(scene: Scene, device: str) -> Iterator[Answer]:
     solver.step(scene.steps)
     moved = (solver.state.x.numpy() - solver.constants.X).mean(0)
     way = -0.5 * scene.gravity[2] * scene.duration**2 * (math.sin(theta) - friction * math.cos(theta))
-    yield Answer("way in 0.3 s", "m", (round(way, 6),), "½ g t² (sin θ − μ cos θ)", abs(float(moved[0])))
+    down = math.copysign(1.0, scene.base_gravity[0])
+    name = f"way in {scene.duration:.3g} s"
+    yield Answer(name, "m", (round(way, 6),), "½ g t² (sin θ − μ cos θ)", down * float(moved[0]))

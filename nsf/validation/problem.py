@@ -1,12 +1,17 @@
 """The parts that the problems share: an answer, rest by dynamic relaxation, positions of material points."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM
 from nsf.scenes import Box, Scene
+
+#: Steps from one look at the kinetic energy to the next; looks, at most, until a body is at rest.
+_BETWEEN, _LOOKS = 10, 20_000
 
 
 @dataclass(frozen=True)
@@ -41,13 +46,18 @@ def relax(solver: FullOrderMPM, load: Callable[[], object] = lambda: None, still
         solver: at any state.
         load: called before each step.
         still: share of the highest peak of kinetic energy at which the body counts as at rest.
+
+    Raises:
+        InstabilityError: it does not come to rest.
     """
     before = highest = 0.0
-    while True:
+    for _ in range(_LOOKS):
         for _ in range(_BETWEEN):
             load()
             solver.step()
         energy = kinetic_energy(solver)
+        if not math.isfinite(energy):
+            break
         if energy < before:
             solver.state.v.rows.zero_()
             solver.state.C.rows.zero_()
@@ -55,9 +65,9 @@ def relax(solver: FullOrderMPM, load: Callable[[], object] = lambda: None, still
                 return
             highest, energy = max(highest, before), 0.0
         before = energy
-
-
-_BETWEEN = 10  # steps from a look at the kinetic energy to the next
+    raise InstabilityError(
+        f"{solver.steps_taken} steps bring no rest (kinetic energy {energy:.3g} J); set a smaller scene.dt"
+    )
 
 
 def kinetic_energy(solver: FullOrderMPM) -> float:

@@ -105,12 +105,17 @@ class _Typed(ast.NodeTransformer):
     """Gives numbers and constants of modules the type of p: Warp would take them for fp32 and int."""
 
     def __init__(self, method: FunctionType):
+        self._function = method.__name__
         names = method.__code__.co_varnames
         self._strain = names[1]
         self._constants = {key: value for key, value in method.__globals__.items() if key not in names}
 
     def visit(self, node: ast.AST) -> ast.AST:
         """The node, or its number as `type(p)(number)`."""
+        if isinstance(node, ast.FunctionDef) and node.name == self._function:
+            node.decorator_list, node.returns, node.args.defaults = [], None, []
+            for argument in node.args.args:
+                argument.annotation = None  # which need not exist at run time
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Call):
             return node  # has its type
         value = _value(node, self._constants)

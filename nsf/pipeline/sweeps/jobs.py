@@ -5,7 +5,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -70,9 +70,11 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     pipeline.group = group
     needs_others = len(stages) > 1 and not pipeline.complete(stages)
     if needs_others and not group:
-        from nsf.pipeline.preview import stages_of, time_of
+        checked = pipeline.check()
+        with suppress(Exception):  # a user's class may allow no estimate; what is wrong, a stage says
+            from nsf.pipeline.preview import stages_of, time_of
 
-        say(f"run: {time_of(stages_of([pipeline.check()]))} to go")
+            say(f"run: {time_of(stages_of([checked]))} to go")
     with pipeline.tracked, reserving(pipeline.inputs if needs_others else ()):
         for at, name in enumerate(stages):
             with timed(name):

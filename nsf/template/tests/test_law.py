@@ -9,7 +9,7 @@ from PROJECT import Law
 
 
 def test_sheared_body_carries_its_flow_stress():
-    values = yaml.safe_load(Path("conf/material/law.yaml").read_text())
+    values = yaml.safe_load((Path(__file__).parents[1] / "conf/material/law.yaml").read_text())
     law = Law(**{name: value for name, value in values.items() if name != "_target_"})
     _, F = deformation_path("simple_shear", 1.0, 2001)
     tau = drive(law, F, dt=1e-3)[-1]
