@@ -86,7 +86,7 @@ def _dispatch(arguments: list[str]) -> int:
         names = (*STAGES, *TOOLS)
         near = difflib.get_close_matches(stage, names, n=1)
         hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(names)}"
-        raise ConfigError(f"unknown stage {stage!r}; {hint}")
+        raise ConfigError(f"unknown command {stage!r}; {hint}")
     if {"-h", "--help"} & set(overrides):
         print(usage.of_stage(stage))
         return 0

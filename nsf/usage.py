@@ -23,7 +23,7 @@ TOOLS = {
     "serve": ("a deployment's latent vectors as a stream that many browsers decode", None),
     "demo": (
         "a model that runs in the browser: drag, tilt and steer it, with no server and nothing to train",
-        "[model=block] [folder=PATH] [open=true]; block, sand or metal; reports/demo by default",
+        "[model=block] [folder=PATH] [open=true]; block, tray or metal; reports/demo by default",
     ),
     "export": (
         "a deployed run for other programs: HTML page, the model itself in a page, USD, VTK, ONNX, film",

@@ -136,6 +136,8 @@ def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[Di
 def _unparsed(override: str, first: str) -> str:
     """Why Hydra does not read an override, and how to write it; a shell takes one pair of quotes away."""
     key, _, value = override.partition("=")
+    if value != (shorter := value.strip(",")):
+        return f"{override!r} has a comma too many; write {key}={shorter}"
     if re.fullmatch(r"[+~\w.@/]+", key) and value and not re.search(r"['\"{}\[\]$\\]", value):
         return f"{override!r} needs quotes of Hydra's inside those of the shell; write '{key}=\"{value}\"'"
     return f"{override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"

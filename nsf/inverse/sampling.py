@@ -173,8 +173,15 @@ class Runs:
 
     @property
     def trusted(self) -> np.ndarray:
-        """[B] whether a run is to be believed."""
+        """[B] whether a run is to be believed, as far as a bound tells: NaN tells nothing."""
         return ~(self.error_bound > self.limit) & np.isfinite(self.values).all((1, 2))
+
+    @property
+    def doubts(self) -> str:
+        """How many runs are distrusted, or that nothing tells."""
+        if np.isnan(self.error_bound).any():
+            return "whose errors no bound tells (set scene.design.validation)"
+        return f"{int((~self.trusted).sum()):,} of them distrusted and left out"
 
     def quantiles(self) -> dict[str, np.ndarray]:
         """[`LEVELS`, F] of trusted runs, by name.

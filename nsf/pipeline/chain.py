@@ -64,6 +64,7 @@ class Pipeline(Configured):
         self._chosen: Model | None = None
         self._learned: Run | None = None
         self._simulations: dict[tuple[Case, int], Run] = {}
+        self._deployments: dict[tuple[int, Run | None], Run] = {}
         self._samples = self._sets = self._taught = self._fitted = None
         super().__init__(config)
 
@@ -208,9 +209,16 @@ class Pipeline(Configured):
 
     training = property(naming.training)
     encoding = property(naming.encoding)
-    deployment = property(naming.deployment)
     evaluation = property(naming.evaluation)
     superresolution = property(naming.superresolution)
+
+    @property
+    def deployment(self) -> Run:
+        """The run of the reduced trajectories."""
+        key = id(self._chosen), self._learned  # a name is asked for often, and takes some milliseconds
+        if key not in self._deployments:
+            self._deployments[key] = naming.deployment(self)
+        return self._deployments[key]
 
     @property
     def taught(self) -> Run:

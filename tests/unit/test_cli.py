@@ -267,7 +267,7 @@ def test_an_unstable_step_names_the_largest_stable_one(nsf, tmp_path):
 def test_unknown_stage(nsf, stage, near):
     code, _, err = nsf(stage, tiny_scene=False)
     assert code == 2
-    assert f"unknown stage '{stage}'" in err
+    assert f"unknown command '{stage}'" in err
     assert near in err
 
 

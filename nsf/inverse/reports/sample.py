@@ -69,8 +69,10 @@ def sampling(
         say(f"sample: posterior given {len(view.observations)} observations: {chain.text}")
         drawn = chain.values[np.random.default_rng(seed).integers(0, len(chain.values), count)]
     made = runs(model, drawn, scalars, problem.forcing)
-    lost, bands = int((~made.trusted).sum()), made.quantiles()
-    say(f"sample: {count:,} runs in {made.seconds:.2f} s, {lost:,} of them distrusted")
+    bands = made.quantiles()
+    say(f"sample: {count:,} runs in {made.seconds:.2f} s, {made.doubts}")
+    if np.isnan(made.error_bound).any():
+        warnings = [*warnings, f"runs {made.doubts}"]
     if indices:
         table, simulated = _indices(problem, prior, scalars, indices, full_order, seed, say)
         files["sensitivities.csv"] = table
@@ -80,7 +82,7 @@ def sampling(
         tables.append(frame_table("Sensitivities at the end", shown, note, text=2))
         charts.append(Chart("Sensitivities", "sensitivities", _INDICES, indices_chart(table)))
     files |= {"quantiles.csv": _quantiles(scalars, bands), "runs.csv.gz": _each(problem, made)}
-    note = f"{count:,} runs, {lost:,} of them distrusted and left out."
+    note = f"{count:,} runs, {made.doubts}."
     tables.append(frame_table("At the end", _ends(bands), note))
     caption = "Quantiles of trusted runs over time."
     charts.append(Chart("Quantiles over time", "quantiles", caption, bands_chart(scalars.t, bands, LEVELS)))
@@ -98,7 +100,7 @@ def sampling(
         tables=tables,
         files=files,
         charts=charts,
-        facts=[("Runs", f"{count:,} in {made.seconds:.2f} s"), ("Distrusted", f"{lost:,}")],
+        facts=[("Runs", f"{count:,} in {made.seconds:.2f} s"), ("Error bounds", made.doubts)],
         definitions=_TERMS,
         warnings=warnings,
         settings={"count": count, "of": scalars.names, "seed": seed, "sensitivities": indices}
