@@ -172,20 +172,9 @@ class RestrictedField:
     def _coefficients(self, inputs: Tensor, rate: Tensor | None = None) -> Tensor:
         a = [inputs[..., : self.leading]] if self.leading or self.network is None else []
         if self.network is not None:
-            outputs = self._outputs(inputs)
+            outputs = self.network(inputs)
             a.append(at_rate(outputs, self._checked(rate)) if self.rates else outputs)
         return torch.cat(a, -1) if len(a) > 1 else a[0]
-
-    def _outputs(self, inputs: Tensor) -> Tensor:
-        """The network's outputs; to call its modules takes twice as long as to launch their kernels."""
-        *hidden, last = self._layers
-        for layer in hidden:
-            inputs = self.network.activation(F.linear(inputs, *layer))
-        return F.linear(inputs, *last)
-
-    @functools.cached_property
-    def _layers(self) -> list[tuple[Tensor, Tensor]]:
-        return [(layer.weight, layer.bias) for layer in self.network.layers]
 
     def _checked(self, rate: Tensor | None) -> Tensor:
         if rate is None:
