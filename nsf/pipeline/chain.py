@@ -222,7 +222,7 @@ class Pipeline(Configured):
 
     @property
     def taught(self) -> Run:
-        """What the model learned; of a chain that is opened from a deployment, on whatever device it did."""
+        """The run of what the model learned; of a chain opened from a deployment, on whatever device."""
         return self._learned or naming.taught(self)
 
     def runs_of(self, stage: str) -> list[Run]:

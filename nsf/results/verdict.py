@@ -17,7 +17,7 @@ _RIVALS = [name for name in RIVALS if name != "displacement_static"]
 
 
 def verdict(frame: pd.DataFrame) -> list[tuple[str, str]]:
-    """What is answered, and the answer; nothing where a table compares several models, or scenes.
+    """Names of answers and the answers; nothing where a table compares several models, or scenes.
 
     Args:
         frame: as `nsf.results.table.labelled` gives it.
@@ -62,13 +62,9 @@ def _bound(frame: pd.DataFrame) -> str:
     ends = " to ".join(dict.fromkeys(number(end, 100) for end in (bounds.min(), bounds.max())))
     held = int((frame["displacement_error"] <= bounds).sum())
     flags = ", ".join(f"{count} {flag}" for flag, count in frame["flag"].value_counts().items() if flag)
-    lights = (
-        f"; {flags} (at most half of trust.limit, 10 % by default)"
-        if "green" in flags
-        else f"; {flags}"
-        if flags
-        else ""
-    )
+    lights = f"; {flags}" * bool(flags)
+    if "green" in flags:
+        lights += " (at most half of trust.limit, 10 % by default)"
     return f"{ends} %, to hold in 90 % of runs, held by {held} of {len(frame)} runs{lights}"
 
 

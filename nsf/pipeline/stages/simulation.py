@@ -35,14 +35,14 @@ def _helpers(pipeline, scenes: Iterable[Scene]) -> int:
     return cores.helper_count(pipeline.device, list(scenes), size)
 
 
-def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str], pool=None) -> int:
+def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str], begun=None) -> int:
     """Make the trajectories of a pipeline that are not there; gives how many were made here.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
         missing: their runs.
         warned: warnings that were said already.
-        pool: of `helpers_ahead`.
+        begun: of `helpers_ahead`.
     """
     runs = _needed(pipeline, missing)
     warnings = {run: resolution_warnings(scene.at(case)) for run, (case, scene) in runs.items()}
@@ -50,7 +50,7 @@ def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str]
         if line not in warned:
             pipeline.say(f"simulate: warning: {line}")
     started = time.perf_counter()
-    made = make(pipeline, runs, warnings, pool)
+    made = make(pipeline, runs, warnings, begun)
     elsewhere = f", {len(runs) - made} by another process" if made < len(runs) else ""
     pipeline.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
     odd = [line for run in runs for line in run.manifest.get("warnings", ()) if line in (STILL, RIGID, FLAT)]
@@ -63,7 +63,7 @@ def make(
     pipeline,
     runs: Mapping[Run, tuple[Case, Scene]],
     warnings: Mapping[Run, Sequence[str]] = MappingProxyType({}),
-    pool=None,
+    begun=None,
 ) -> int:
     """Make trajectories of a pipeline; gives how many were made here.
 
@@ -71,7 +71,7 @@ def make(
         pipeline: a `nsf.pipeline.Pipeline`.
         runs: to be made, at least one, each with its case and scene.
         warnings: lines of some, for their manifests.
-        pool: of `helpers_ahead`.
+        begun: of `helpers_ahead`.
     """
     from nsf.pipeline.checks import check_room
 
@@ -86,4 +86,4 @@ def make(
     jobs = [job(run, *needed) for run, needed in runs.items()]
     count, own = _helpers(pipeline, (scene for _, scene in runs.values())), pipeline.scene
     shared = Shared(own.steps, every, own.dx, pipeline.stored, device, c.precision, count)
-    return simulate(jobs, shared, pipeline.say, pool)
+    return simulate(jobs, shared, pipeline.say, begun)

@@ -90,7 +90,7 @@ class Ending(NamedTuple):
     warnings: Sequence[str]
 
 
-def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], pool=None) -> int:
+def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], begun=None) -> int:
     """Run and store every job; each file appears when it is whole.
 
     Processes with the same jobs share them: what another one is making is left to it, and waited for at the
@@ -100,7 +100,7 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], 
         jobs: trajectories to be made.
         shared: what they have in common.
         say: called with a line on a trajectory that is waited for, or where something was odd.
-        pool: of the helpers, where they were started ahead.
+        begun: the helping processes, where they were started ahead (`nsf.pipeline.stages.cores.ahead`).
 
     Returns:
         How many were made, here and by the helpers.
@@ -113,22 +113,22 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], 
     frames, help_with = len(jobs) * shared.frames, partial(_help, jobs, shared)
     with (
         Progress("simulate", frames, "frames") as progress,
-        helping(help_with, shared.helpers, progress.advance, pool) as helpers,
-        ThreadPoolExecutor(_WRITERS) as pool,
+        helping(help_with, shared.helpers, progress.advance, begun) as helpers,
+        ThreadPoolExecutor(_WRITERS) as writers,
     ):
 
         def advance(count: int = 1) -> None:
             progress.advance(count)
             helpers.look()
 
-        writing, left = _share(jobs, shared, pool, HostMemory(), advance, say, progress.describe)
+        writing, left = _share(jobs, shared, writers, HostMemory(), advance, say, progress.describe)
         made = len(writing)
         for count, lines in helpers.results():
             made += count
             for line in lines:
                 say(line)
         if left:
-            late, _ = _share(left, shared, pool, HostMemory(), advance, say, progress.describe, wait=True)
+            late, _ = _share(left, shared, writers, HostMemory(), advance, say, progress.describe, wait=True)
             writing, made = writing + late, made + len(late)
         for future in writing:
             future.result()
