@@ -294,11 +294,9 @@ class Pipeline(Configured):
             with timed(START):
                 from nsf.pipeline.stages.simulation import helpers_ahead, simulate_missing
 
-            with helpers_ahead(self, missing) as pool:
-                self.check()
-                with measured(self, "simulate") as works:
-                    if simulate_missing(self, missing, warned, pool) < len(missing) or needless:
-                        works.clear()
+            with helpers_ahead(self, missing) as pool, measured(self, "simulate") as works:
+                if simulate_missing(self, missing, warned, pool) < len(missing) or needless:
+                    works.clear()
         return runs
 
     def full_order(self, cases: Sequence[Case]) -> list[Run]:

@@ -5,11 +5,8 @@ from collections.abc import Mapping
 from nsf import config as configuration
 from nsf.data import Case
 from nsf.errors import ConfigError
-from nsf.kinematics.fields.basis import BasisField
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
-from nsf.sampling.cubature import CubatureSampler
-from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
 from nsf.scenes.checks import check_memory, check_physics
 from nsf.storage import require_folder, require_space
@@ -28,6 +25,9 @@ def check(pipeline) -> None:
         ConfigError: a value is refused; names it.
         InstabilityError: Δt is unstable in a case.
     """
+    from nsf.sampling.cubature import CubatureSampler  # with torch, which takes more than a second to load
+    from nsf.sampling.sampler import check_well_posed
+
     c = pipeline.config
     with configuration.naming_the_missing():
         field, sampler, integration = pipeline.field, pipeline.sampler, pipeline.integration
@@ -44,7 +44,7 @@ def check(pipeline) -> None:
         for region in sampler.regions:
             check_well_posed(region.size, c.latent_dim)
             region.candidates(X)
-        _check_cases(pipeline)
+        check_cases(pipeline)
 
 
 def check_batched(size: int, field, strategy: str) -> None:
@@ -55,6 +55,8 @@ def check_batched(size: int, field, strategy: str) -> None:
     """
     if size == 1:
         return
+    from nsf.kinematics.fields.basis import BasisField
+
     if not isinstance(field, BasisField):
         raise ConfigError(
             f"deploy.batch={size} needs field=basis, whose steps are taken in coefficients; "
@@ -78,8 +80,13 @@ def _check_carried(batch: int, sampler) -> None:
         )
 
 
-def _check_cases(pipeline) -> None:
-    """Build the scene in every case: a value out of range fails before any work."""
+def check_cases(pipeline) -> None:
+    """Build the scene in every case: a value out of range fails before any work.
+
+    Raises:
+        ConfigError: a value is refused; names it.
+        InstabilityError: Δt is unstable in a case.
+    """
     needed, multiplier = pipeline.needed(), pipeline.config.deploy.dt_multiplier
     signature = repr((pipeline.scene, pipeline.deployed, needed, multiplier))
     if signature in _PASSED:

@@ -11,7 +11,7 @@ import pytest
 
 from nsf.data import Trajectory, TrajectoryWriter
 from nsf.data.schema import TRAJECTORY
-from nsf.errors import InstabilityError
+from nsf.errors import ConfigError, InstabilityError
 from nsf.gpu import without_collection
 from nsf.pipeline.stages import cores, trajectories
 from nsf.progress import Progress
@@ -75,6 +75,19 @@ def test_helping_processes_count_here(early):
 def test_an_error_of_another_process_is_one_here():
     with pytest.raises(InstabilityError, match="it burst"), cores.helping(helped.fail, 1, print) as helpers:
         helpers.results()
+
+
+def test_an_error_ends_the_others_at_once():
+    with pytest.raises(InstabilityError), cores.helping(helped.fail_first, 2, lambda steps: None) as helpers:
+        helpers.results()
+
+
+def test_a_bad_field_ends_runs_that_have_begun(pipeline_at, tmp_path, monkeypatch):
+    monkeypatch.setattr(cores, "helper_count", lambda *of: 1)
+    pipeline = pipeline_at(tmp_path, "field.depth=0", "scene.steps=20000")
+    with pytest.raises(ConfigError, match=r"field: depth=0"):
+        pipeline.simulate()
+    assert not any(run.complete for run in pipeline.runs_of("simulate"))
 
 
 def test_processes_end_where_this_one_fails():

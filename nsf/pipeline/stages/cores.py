@@ -1,12 +1,11 @@
-"""Helping processes, a core each, with which this one shares full-order runs on a CPU."""
+"""Helping processes, a core each, which share full-order runs on a CPU."""
 
 import contextlib
 import importlib
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -71,11 +70,13 @@ class Helpers:
         """The result of each, once all have ended.
 
         Raises:
-            Exception: the first one that ended the work of a process.
+            Exception: the first one that ended the work of a process, at once.
         """
-        while not all(future.done() for future in self._futures):
-            time.sleep(_POLL)
+        while wait(self._futures, _POLL, FIRST_EXCEPTION).not_done:
             self.look()
+            for future in self._futures:
+                if future.done():
+                    future.result()
         self.look()
         return [future.result() for future in self._futures]
 
@@ -112,7 +113,7 @@ def helping(
         work: of a process, by its number, what counts its steps and the folder of `claim`; importable.
         count: of the processes; 0 for none.
         advance: counts their steps here.
-        pool: of as many processes, started `ahead`; new ones by default.
+        pool: of as many processes or more, started `ahead`; new ones by default.
     """
     with TemporaryDirectory(prefix="nsf-") as name:
         folder = Path(name)

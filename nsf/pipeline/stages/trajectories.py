@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,7 +60,7 @@ class Shared:
         dx: grid spacing [m], for the file.
         stored: precision of the stored frames.
         device, precision: of the physics, for the manifest.
-        helpers: how many helping processes share the jobs.
+        helpers: how many processes make the trajectories, each a share; 0 where this one does.
     """
 
     steps: int
@@ -90,7 +91,13 @@ class Ending(NamedTuple):
     warnings: Sequence[str]
 
 
-def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], begun=None) -> int:
+def simulate(
+    jobs: Sequence[Job],
+    shared: Shared,
+    say: Callable[[str], object],
+    begun=None,
+    meanwhile: Callable[[], object] = lambda: None,
+) -> int:
     """Run and store every job; each file appears when it is whole.
 
     Processes with the same jobs share them: what another one is making is left to it, and waited for at the
@@ -101,6 +108,7 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], 
         shared: what they have in common.
         say: called with a line on a trajectory that is waited for, or where something was odd.
         begun: the helping processes, where they were started ahead (`nsf.pipeline.stages.cores.ahead`).
+        meanwhile: called here while the helpers work; where it raises, they stop.
 
     Returns:
         How many were made, here and by the helpers.
@@ -110,36 +118,30 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], 
         StorageError: the disk refused a file.
         KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
     """
-    frames, help_with = len(jobs) * shared.frames, partial(_help, jobs, shared)
-    with (
-        Progress("simulate", frames, "frames") as progress,
-        helping(help_with, shared.helpers, progress.advance, begun) as helpers,
-        ThreadPoolExecutor(_WRITERS) as writers,
-    ):
-
-        def advance(count: int = 1) -> None:
-            progress.advance(count)
-            helpers.look()
-
-        writing, left = _share(jobs, shared, writers, HostMemory(), advance, say, progress.describe)
-        made = len(writing)
-        for count, lines in helpers.results():
-            made += count
-            for line in lines:
+    progress = Progress("simulate", len(jobs) * shared.frames, "frames")
+    help_with = partial(_help, jobs, shared)
+    with helping(help_with, shared.helpers, progress.advance, begun) as helpers:
+        meanwhile()
+        with progress, ThreadPoolExecutor(_WRITERS) as writers:
+            share = partial(
+                _share, shared=shared, pool=writers, memory=HostMemory(), advance=progress.advance, say=say,
+                describe=progress.describe,
+            )  # fmt: skip
+            writing, left = ([], jobs) if shared.helpers else share(jobs)
+            ended = helpers.results()
+            for line in chain.from_iterable(lines for _, lines in ended):
                 say(line)
-        if left:
-            late, _ = _share(left, shared, writers, HostMemory(), advance, say, progress.describe, wait=True)
-            writing, made = writing + late, made + len(late)
-        for future in writing:
-            future.result()
-    return made
+            writing += share(left, wait=True)[0]
+            for future in writing:
+                future.result()
+    return len(writing) + sum(count for count, _ in ended)
 
 
 def _help(
     jobs: Sequence[Job], shared: Shared, number: int, advance: Advance, folder: Path
 ) -> tuple[int, list[str]]:
     """Make what no other process makes, each helper from elsewhere on; how many, and lines for the user."""
-    begin, lines = (number + 1) * len(jobs) // (shared.helpers + 1), []
+    begin, lines = number * len(jobs) // shared.helpers, []
     with ThreadPoolExecutor(_WRITERS) as pool:
         order = [*jobs[begin:], *jobs[:begin]]
         writing, _ = _share(order, shared, pool, HostMemory(), advance, lines.append)
