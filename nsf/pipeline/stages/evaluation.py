@@ -13,6 +13,7 @@ from nsf.errors import SchemaError
 from nsf.evaluation import (
     Comparison,
     Rivals,
+    SolverCost,
     Subject,
     coarse_subjects,
     compare,
@@ -57,15 +58,12 @@ def evaluate(pipeline, run: Run) -> None:
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
         comparisons, beside = zip(*pairs, strict=True)
-        cost = _cost(pipeline, manifold, rollouts, beside[0].factors)
-        seconds = pipeline.training.metric("training_seconds")
-        offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
-        origin = cost, pipeline.device, run.manifest, pipeline.model.name, offline
-        table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *origin)
-        table["ready_seconds"] = _ready(pipeline.deployment) if cost["trials"] else math.nan
+        measured, decode_ms = _measured(pipeline, manifold, rollouts, beside[0].factors)
+        table = results.rows(pipeline, manifold, rollouts, comparisons, beside, measured, decode_ms)
+        table["ready_seconds"] = _ready(pipeline.deployment) if measured else math.nan
         table["beyond"] = _beyond(pipeline, manifold, rollouts, comparisons)
-        summary = results.summarise(pipeline.config, comparisons, beside, rollouts, seconds)
-        results.write(record, table, comparisons, cost, summary)
+        summary = results.summarise(pipeline.config, comparisons, beside, rollouts)
+        results.write(record, table, comparisons, results.costs(measured, decode_ms), summary)
         if (error := pipeline.deployment.manifest["metrics"].get("validation_error")) is not None:
             record.metrics["validation_error"] = error
     pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} cases → {run.id}")
@@ -155,8 +153,10 @@ def _compare(
         return comparison, rivals(solver, trajectory, pipeline.coarse, training, progress.advance)
 
 
-def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Sequence[int]) -> dict:
-    """Content of `cost.json`, measured in the first held-out case.
+def _measured(
+    pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Sequence[int]
+) -> tuple[dict[str, SolverCost], float]:
+    """Costs of the solvers in the first held-out case, and of decoding [ms]; nothing without trials.
 
     Args:
         pipeline, manifold: that are timed.
@@ -166,7 +166,7 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
     """
     c, scene, case = pipeline.config, pipeline.deployed, pipeline.held_out[0]
     if not c.evaluation.trials:
-        return results.costs({})
+        return {}, math.nan
     full = Subject(lambda: scene.full_order(case, c.precision, pipeline.device), scene.steps)
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
     reduced = Subject(lambda: pipeline.solver_at(manifold, case), steps)
@@ -178,5 +178,4 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
     subjects = {"full_order": full, "reduced": reduced, **beside, **coarse}
     with Progress("evaluate: timings", len(subjects) * (c.evaluation.trials + 1), "runs") as progress:
         measured = measure(subjects, c.evaluation.trials, pipeline.device, progress.advance)
-    decoding = decoding_ms(pipeline.solver_at(manifold, case), rollouts[0], c.evaluation.trials)
-    return results.costs(measured, decoding)
+    return measured, decoding_ms(pipeline.solver_at(manifold, case), rollouts[0], c.evaluation.trials)

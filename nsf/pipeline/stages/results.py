@@ -11,79 +11,58 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nsf.data import Case
-from nsf.deployment import FULL_ORDER, PROJECTED, Rollout, Verdict
+from nsf.deployment import FULL_ORDER, Rollout
 from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.evaluation.surroundings import surroundings
 from nsf.models import describe
 from nsf.results.columns import EVALUATED
 from nsf.runs import Record
+from nsf.runs.provenance import provenance
 from nsf.scenes import Scene
 from nsf.storage import write_json, writing
 
-_COARSE = "coarse_"
-_OF_WHOLE_RUNS = (
-    *("step_ms", "step_ms_p10", "step_ms_p90", "total_ms", "decode_ms", "memory_mib", "break_even_runs"),
-)
+_OF_STEPS = ("step_ms", "step_ms_p10", "step_ms_p90", "total_ms", "memory_mib")
 #: Columns of which the mean over cases is a metric of the run.
 _METRICS = (
-    *("displacement_error", "stress_error", "error_bound", "step_ms_full", "step_ms", "total_ms_full"),
-    *("total_ms", "decode_ms", "memory_full_mib", "memory_mib"),
+    *("delta", "displacement_error", "stress_error", "error_bound", "step_ms_full", "step_ms"),
+    *("total_ms_full", "total_ms", "decode_ms", "memory_full_mib", "memory_mib"),
 )
 
 
-def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> dict:
-    """Content of `cost.json`, by solver; without a solver, that nothing was measured.
+def costs(measured: Mapping[str, SolverCost], decode_ms: float) -> dict:
+    """Content of `cost.json`: the cost of each solver by name; without a solver, that nothing was measured.
 
     `decode_ms` is the time that decoding all frames of a reduced run takes [ms].
     """
     if not measured:
         return {"trials": 0}
-    full, reduced = measured["full_order"], measured["reduced"]
-    return {
-        "full_order": full.as_dict(),
-        "reduced": reduced.as_dict(),
-        **{name: measured[name].as_dict() for name in ("projected",) if name in measured},
-        "coarse": {
-            name.removeprefix(_COARSE): solver.as_dict()
-            for name, solver in measured.items()
-            if name.startswith(_COARSE)
-        },
-        "breakdown": {"reduced": reduced.stages, "full_order": full.stages},
-        "trials": full.trials,
-        "memory_full_mib": full.memory_mib,
-        "memory_reduced_mib": reduced.memory_mib,
-        "step_ms_full": full.step_ms,
-        "step_ms_reduced": reduced.step_ms,
-        "decode_ms": decode_ms,
-    }
+    breakdown = {name: measured[name].stages for name in ("reduced", "full_order")}
+    solvers = {name: cost.as_dict() for name, cost in measured.items()}
+    trials = measured["reduced"].trials
+    return {"trials": trials, "decode_ms": decode_ms, "breakdown": breakdown, **solvers}
 
 
 def rows(
-    config: DictConfig,
+    pipeline,
     manifold,
     rollouts: Sequence[Rollout],
     comparisons: Sequence[Comparison],
     rivals: Sequence[Rivals],
-    cost: dict,
-    device: str,
-    manifest: dict,
-    model: str = "",
-    offline: tuple[float, float] = (math.nan, 0.0),
+    measured: Mapping[str, SolverCost],
+    decode_ms: float,
 ) -> pd.DataFrame:
     """Content of `results.csv`, a row a case with the columns `EVALUATED`; ∞ where a run diverged.
 
     Args:
-        config: of the whole chain, resolved.
-        manifold: the fields.
+        pipeline: a `nsf.pipeline.Pipeline`; manifold: its fields.
         rollouts, comparisons, rivals: of each case.
-        cost: content of `cost.json`. A run costs what its steps cost, those of the model and of its fallback.
-        device, manifest: where, and from what code, the rows are made.
-        model: that took the steps, where `model=auto` chose it.
-        offline: times of training and of teaching [s].
+        measured, decode_ms: as for `costs`. A run costs what the steps of the model that took it cost.
     """
-    commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
-    shared = describe(config, model) | {
+    config, device, origin = pipeline.config, pipeline.device, provenance()
+    training = pipeline.training.metric("training_seconds")
+    teaching = pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
+    shared = describe(config, pipeline.model.name) | {
         "scene": config.scene.name,
         "material": _material(config),
         "field": manifold.field,
@@ -91,20 +70,14 @@ def rows(
         "particles": len(manifold.X),
         "seed": int(config.seed),
         "split": config.deploy.split,
-        "train_seconds": offline[0] if cost.get("trials") else math.nan,
-        "teach_seconds": offline[1],
+        "train_seconds": training if measured else math.nan,
+        "teach_seconds": teaching,
         "precision": config.precision,
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
-        "commit": commit,
+        "commit": str(origin["commit"] or "unknown")[:12] + ("-dirty" if origin["dirty"] else ""),
     }
     content = []
     for rollout, comparison, rival in zip(rollouts, comparisons, rivals, strict=True):
-        as_run = _cost_by(cost, rollout.by)
-        times = _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None))
-        times |= {"break_even_runs": _break_even(as_run, sum(offline))}
-        if rollout.diverged >= 0 or rollout.by == FULL_ORDER:
-            # A step whose particles have left the grid costs no one's speedup, nor does a full-order run.
-            times |= dict.fromkeys(_OF_WHOLE_RUNS, math.nan)
         numbers = list(rollout.case.values())
         of_case = {
             "case": rollout.case.named,
@@ -122,6 +95,7 @@ def rows(
             "flag_reason": rollout.verdict.reason,
         }
         off = {f"{name}_error": comparison.quantities.get(name, math.nan) for name in QUANTITIES}
+        times = _times(measured, decode_ms, rollout, next(iter(rival.coarse), 0), training + teaching)
         content.append(shared | of_case | _beside(rival) | times | off)
     return pd.DataFrame(content).reindex(columns=list(EVALUATED))
 
@@ -143,36 +117,30 @@ def _beside(rivals: Rivals) -> dict[str, float]:
     }
 
 
-def _cost_by(cost: dict, by: str) -> dict:
-    """`cost.json` of a run that another model took."""
-    return cost | {"reduced": cost[PROJECTED]} if by == PROJECTED and PROJECTED in cost else cost
+def _times(
+    measured: Mapping[str, SolverCost], decode_ms: float, rollout: Rollout, factor: int, seconds: float
+) -> dict[str, float]:
+    """Columns of costs of a run; those that were not measured are left out.
 
+    A step whose particles have left the grid costs no one's speedup, nor does a full-order run.
 
-def _costs_in_a_row(cost: dict, factor: int | None) -> dict[str, float]:
-    """Columns of `results.csv`, of the coarse run at a factor of Δx; NaN where nothing was measured."""
-    solvers = {
-        "": cost.get("reduced", {}),
-        "_full": cost.get("full_order", {}),
-        "_coarse": cost.get("coarse", {}).get(str(factor), {}),
-    }
-    times = {f"{name}{end}": of.get(name) for end, of in solvers.items() for name in ("step_ms", "total_ms")}
-    times |= {name: solvers[""].get(name) for name in ("step_ms_p10", "step_ms_p90", "memory_mib")}
-    times |= {"memory_full_mib": solvers["_full"].get("memory_mib"), "decode_ms": cost.get("decode_ms")}
-    return {name: math.nan if value is None else value for name, value in times.items()}
-
-
-def _break_even(cost: dict, seconds: float) -> float:
-    """Runs after which what was spent beforehand [s] has paid; ∞ where a reduced run saves no time."""
-    full, reduced = (cost.get(solver, {}).get("total_ms", math.nan) for solver in ("full_order", "reduced"))
-    saved = 1e-3 * (full - reduced)
-    return math.inf if saved <= 0.0 else seconds / saved
-
-
-def trust_of(case: Case, verdict: Verdict) -> dict:
-    """Entry of `summary.json`; a number that is not finite is null."""
-    numbers = {"error": verdict.error_share, "error_bound": verdict.bound_share}
-    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-    return {"case": case.named, **finite, "flag": verdict.flag, "reason": verdict.reason}
+    Args:
+        measured, decode_ms: as for `costs`.
+        rollout: the run; factor: of Δx of the coarse run.
+        seconds: spent beforehand, for the runs after which it has paid: ∞ where a reduced run saves no time.
+    """
+    if not measured:
+        return {}
+    full, coarse = measured["full_order"], measured.get(f"coarse_{factor}")
+    times = {"step_ms_full": full.step_ms, "total_ms_full": full.total_ms, "memory_full_mib": full.memory_mib}
+    if coarse:
+        times |= {"step_ms_coarse": coarse.step_ms, "total_ms_coarse": coarse.total_ms}
+    if rollout.diverged >= 0 or rollout.by == FULL_ORDER:
+        return times
+    reduced = measured.get(rollout.by, measured["reduced"])
+    saved = 1e-3 * (full.total_ms - reduced.total_ms)
+    times |= {"decode_ms": decode_ms, "break_even_runs": seconds / saved if saved > 0.0 else math.inf}
+    return times | {name: getattr(reduced, name) for name in _OF_STEPS}
 
 
 def summarise(
@@ -180,31 +148,18 @@ def summarise(
     comparisons: Sequence[Comparison],
     rivals: Sequence[Rivals],
     rollouts: Sequence[Rollout],
-    seconds: float,
 ) -> dict:
-    """Content of `summary.json`; `seconds` is the training's wall time."""
-
-    def mean(name: str) -> float:
-        return float(np.mean([getattr(c, name) for c in comparisons]))
-
-    summary = {
+    """Content of `summary.json`: what `results.csv` has no column for."""
+    names = ("reconstruction_delta", "reconstruction_stress_error")
+    cases = [rollout.case.named for rollout in rollouts]
+    return {
         "title": config.scene.title,
         "scale": config.scale,
-        "cases": [dict(rollout.case) for rollout in rollouts],
-        "training_seconds": seconds,
         "changes": OmegaConf.to_container(config.deploy).get("changes") or {},
-        "delta": mean("delta") if math.isfinite(mean("delta")) else None,
-        "reconstruction_delta": mean("reconstruction_delta"),
-        "reconstruction_stress_error": mean("reconstruction_stress_error"),
-        "trust": [trust_of(rollout.case, rollout.verdict) for rollout in rollouts],
-        "rivals": [
-            {"case": rollout.case.named} | asdict(beside)
-            for rollout, beside in zip(rollouts, rivals, strict=True)
-        ],
+        **{name: float(np.mean([getattr(one, name) for one in comparisons])) for name in names},
+        "rivals": [{"case": case} | asdict(rival) for case, rival in zip(cases, rivals, strict=True)],
+        "paper": OmegaConf.to_container(config.scene).get("paper"),
     }
-    if config.scene.get("paper"):
-        summary["paper"] = OmegaConf.to_container(config.scene.paper)
-    return summary
 
 
 def write(
@@ -228,7 +183,7 @@ def write(
     write_json(path / "summary.json", summary)
     for name in (*tables, "frames.npz", "cost.json", "summary.json"):
         record.output(name)
-    record.metrics.update({name: summary[name] for name in ("delta", "reconstruction_delta")})
+    record.metrics["reconstruction_delta"] = summary["reconstruction_delta"]
     averages = results[list(_METRICS)].mean(skipna=False)
     record.metrics.update(averages[np.isfinite(averages)].to_dict())
     record.metrics["diverged"] = results.loc[np.isinf(results["delta"]), "case"].tolist()
