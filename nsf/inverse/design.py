@@ -21,34 +21,29 @@ _STARTS = 64  # programs that are tried in one batch
 _HARDLY = 1e-6  # [m] of a solid that does not move
 
 
-@dataclass(frozen=True)
-class Coordinates:
-    """The numbers that a program sets at its knots.
+class Program(ABC):
+    """A program that is linear between knots evenly spread in time, within bounds.
 
-    Attributes:
-        names: [k]; unit: theirs.
+    Args:
+        model: of the runs; knots: how many are free.
+        names: [k] of the numbers that are set at each knot; unit: theirs.
         bounds: [k, 2] smallest and largest value.
         first: [k] value at t = 0, which is no knot.
         rates: [k, 2] smallest and largest change in a step.
     """
 
-    names: Sequence[str]
-    unit: str
-    bounds: np.ndarray
-    first: np.ndarray
-    rates: np.ndarray
-
-
-class Program(ABC):
-    """A program that is linear between knots evenly spread in time, within bounds.
-
-    Attributes:
-        model: of the runs; knots: how many are free; coordinates: set at each knot.
-    """
-
-    model: Model
-    knots: int
-    coordinates: Coordinates
+    def __init__(
+        self,
+        model: Model,
+        knots: int,
+        names: Sequence[str],
+        unit: str,
+        bounds: np.ndarray,
+        first: np.ndarray,
+        rates: np.ndarray,
+    ):
+        self.model, self.knots, self.names, self.unit = model, knots, tuple(names), unit
+        self.bounds, self._first, self._rates = bounds, first, rates
 
     @abstractmethod
     def forcing(self, values: Tensor) -> Forcing:
@@ -60,10 +55,10 @@ class Program(ABC):
 
     def values(self, knots: Tensor) -> Tensor:
         """[B, N + 1, k] of knots [B, knots, k], each from 0 to 1 of the reach from the knot before it."""
-        low, high = torch.as_tensor(self.coordinates.bounds).to(knots).unbind(1)
+        low, high = torch.as_tensor(self.bounds).to(knots).unbind(1)
         steps = (len(self.model.t) - 1) / self.knots
-        back, on = torch.as_tensor(steps * self.coordinates.rates).to(knots).unbind(1)
-        states = [torch.as_tensor(self.coordinates.first).to(knots).expand(len(knots), -1)]
+        back, on = torch.as_tensor(steps * self._rates).to(knots).unbind(1)
+        states = [torch.as_tensor(self._first).to(knots).expand(len(knots), -1)]
         for share in knots.unbind(1):
             least, most = torch.maximum(low, states[-1] + back), torch.minimum(high, states[-1] + on)
             states.append(least + share * (most - least))
@@ -87,7 +82,6 @@ class Tilt(Program):
     """
 
     def __init__(self, model: Model, angle: float, knots: int = 6):
-        self.model, self.knots = model, knots
         self._gravity = np.array(model.scene.base_gravity)
         if not np.any(self._gravity):
             raise ConfigError(f"{model.scene.name} has no gravity to tilt; move a solid, as move=NAME")
@@ -99,7 +93,9 @@ class Tilt(Program):
                 "train with programs of scene.forcing.gravity"
             )
         # A square within the disc.
-        self.coordinates = Coordinates(
+        super().__init__(
+            model,
+            knots,
             names=("tilt along the first axis", "tilt along the second axis"),
             unit="°",
             bounds=np.array([[-1.0, 1.0]] * 2) * angle / np.sqrt(2.0),
@@ -191,11 +187,10 @@ class Moves(Program):
     """
 
     def __init__(self, model: Model, solids: Sequence[str], knots: int = 6):
-        self.model, self.knots = model, knots
         colliders = dict(zip(model.scene.colliders, model.scene.solids, strict=True))
         if unknown := [name for name in solids if name not in colliders]:
             raise ConfigError(f"move={unknown[0]} is no solid of the scene; there are {', '.join(colliders)}")
-        self.tracks = self._tracks(solids)
+        self.tracks = _tracks(model, solids)
         programs = model.pipeline.scene.forcing.colliders
         if still := [name for name in solids if name not in programs or not len(self.tracks[name].axes)]:
             raise ConfigError(
@@ -205,7 +200,9 @@ class Moves(Program):
         if turning := [n for n in solids if (m := colliders[n].motion) is not None and m.turns]:
             raise ConfigError(f"move={turning[0]} turns as well; only solids that shift alone are designed")
         tracks = self.tracks.values()
-        self.coordinates = Coordinates(
+        super().__init__(
+            model,
+            knots,
             names=[
                 f"{name} along ({', '.join(f'{a:.2g}' for a in axis)})"
                 for name, track in self.tracks.items()
@@ -216,13 +213,6 @@ class Moves(Program):
             first=np.concatenate([track.begun @ track.axes.T for track in tracks]),
             rates=np.concatenate([track.rates for track in tracks]),
         )
-
-    def _tracks(self, solids: Sequence[str]) -> dict[str, Track]:
-        """How each solid moved in the training runs."""
-        pipeline, order = self.model.pipeline, list(self.model.scene.colliders)
-        scenes = [pipeline.scene.at(case) for case in pipeline.split.train]
-        states = np.stack([scene.forcing_at(self.model.t)["solids"] for scene in scenes])
-        return {name: Track.of(order.index(name), states[:, :, order.index(name), :3]) for name in solids}
 
     def forcing(self, values: Tensor) -> Forcing:
         """See `Program.forcing`."""
@@ -249,6 +239,14 @@ class Moves(Program):
         tracks = list(self.tracks.values())
         parts = values.split([len(track.axes) for track in tracks], dim=-1)
         return [(track, track.shift(part)) for track, part in zip(tracks, parts, strict=True)]
+
+
+def _tracks(model: Model, solids: Sequence[str]) -> dict[str, Track]:
+    """How each solid moved in the training runs."""
+    pipeline, order = model.pipeline, list(model.scene.colliders)
+    scenes = [pipeline.scene.at(case) for case in pipeline.split.train]
+    states = np.stack([scene.forcing_at(model.t)["solids"] for scene in scenes])
+    return {name: Track.of(order.index(name), states[:, :, order.index(name), :3]) for name in solids}
 
 
 @dataclass(frozen=True)
@@ -283,7 +281,7 @@ def design(program: Program, view: View, parameters, seed: int = 0) -> Designed:
         InstabilityError: no program gives a run that stays finite.
     """
     model, targets = program.model, view.observations
-    mu, shape = model.tensor(parameters), (program.knots, len(program.coordinates.names))
+    mu, shape = model.tensor(parameters), (program.knots, len(program.names))
 
     def run(u: Tensor) -> tuple[Tensor, Forcing]:
         forcing = program.forcing(program.values(u.unflatten(-1, shape)))
@@ -304,28 +302,8 @@ def design(program: Program, view: View, parameters, seed: int = 0) -> Designed:
     return Designed(values, xhat[0].cpu().numpy(), seen, 2.0 * end.cost, str(end.message), error_bound)
 
 
-class Held:
-    """Positions of a run in memory, read as those of a `Trajectory` are.
-
-    Args:
-        x: [N + 1, P, 3] m.
-    """
-
-    def __init__(self, x: np.ndarray):
-        self._x, self.frames = x, len(x)
-
-    def frames_at(self, steps: np.ndarray) -> np.ndarray:
-        """The frames after some numbers of steps."""
-        return steps
-
-    def read(self, _: str, frames, particles: np.ndarray | None = None) -> np.ndarray:
-        """[frames, particles, 3] m."""
-        x = self._x[frames]
-        return x if particles is None else x[:, particles]
-
-
-def full_order(program: Program, designed: Designed, parameters) -> Held:
-    """The full-order run of a designed program."""
+def full_order(program: Program, designed: Designed, parameters) -> np.ndarray:
+    """Positions [N + 1, P, 3] [m] of the full-order run of a designed program."""
     model = program.model
     values = dict(zip(model.names, model.tensor(parameters).tolist(), strict=True))
     scene = program.scene(model.scene.at(model.scene.case(values)), designed.values)
@@ -334,4 +312,4 @@ def full_order(program: Program, designed: Designed, parameters) -> Held:
     for _ in range(scene.steps):
         solver.step()
         frames.append(solver.state.numpy()["x"].astype(np.float32))
-    return Held(np.array(frames))
+    return np.array(frames)

@@ -204,11 +204,14 @@ class View:
             lambda frames: self._model.positions(xhat[:, frames], self._at_body),
         )
 
-    def of_truth(self, trajectory: Trajectory) -> np.ndarray:
-        """[m] of a full-order run."""
+    def of_truth(self, run: Trajectory | np.ndarray) -> np.ndarray:
+        """[m] of a full-order run, or of its positions [N + 1, P, 3] [m]."""
 
-        def read(steps: np.ndarray, particles: np.ndarray | None = None) -> Tensor:
-            x = trajectory.read("x", frames=trajectory.frames_at(steps).tolist(), particles=particles)
+        def read(steps: np.ndarray, particles: np.ndarray | slice = slice(None)) -> Tensor:
+            if isinstance(run, np.ndarray):
+                x = run[steps][:, particles]
+            else:
+                x = run.read("x", frames=run.frames_at(steps).tolist(), particles=particles)
             return torch.as_tensor(x.astype(float))
 
         seen = self._seen(

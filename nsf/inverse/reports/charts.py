@@ -9,12 +9,10 @@ from matplotlib.figure import Figure
 from nsf.results.columns import axis
 from nsf.results.style import (
     FULL,
-    GRID,
     INK,
     MUTED,
     PALETTE,
     figure,
-    legend,
     line_style,
     model_color,
     panels,
@@ -24,7 +22,7 @@ from nsf.vectors import drawn
 
 _BODY = 1500  # particles that show a body
 _RUNS = {"fitted": ("run by recurrence", model_color("recurrence")), "full_order": ("full-order run", FULL)}
-"""Columns of residuals and targets, and the runs that they are of with their colours."""
+"""Columns of residuals, and the runs that they are of with their colours."""
 
 
 def trials_chart(table: pd.DataFrame, units: Mapping[tuple[str, str], str]) -> Figure:
@@ -97,40 +95,6 @@ def residuals_chart(rows: pd.DataFrame) -> Figure:
         panel.grid()
         panel.legend()
     return fig
-
-
-def targets_chart(rows: pd.DataFrame) -> Figure:
-    """Targets less the values of the runs [mm], a row a target, on a bar as long as its tolerance.
-
-    Args:
-        rows: of targets.csv: t, what, X, Y, Z, value, tolerance, fitted and, where that was run, full_order.
-    """
-    at = np.arange(len(rows))
-    with styled():
-        fig = figure(1.6 + 0.5 * len(rows))
-        panel = fig.subplots()
-        width = 1e3 * rows["tolerance"]
-        reach = width.max()
-        panel.barh(at, 2 * width, left=-width, height=0.6, color=GRID, label="tolerance")
-        for k, (column, (name, color)) in enumerate(_RUNS.items()):
-            if column in rows:
-                off = 1e3 * (rows["value"] - rows[column])
-                panel.plot(off, at + 0.24 * (k - 0.5), "o", ms=6, label=name, color=color)
-                reach = max(reach, off.abs().max())
-        panel.axvline(0.0, color=MUTED, lw=0.8)
-        panel.set(xlabel="target − run [mm]", xlim=(-1.1 * reach, 1.1 * reach))
-        panel.set_ylim(len(rows) - 0.4, -0.6)
-        panel.set_yticks(at, [_target(row) for row in rows.to_dict("records")])
-        panel.grid(axis="x")
-        legend(fig)
-    return fig
-
-
-def _target(row: Mapping) -> str:
-    """A target in words: `x of (0.5, 0.5, 0.24) m at 0.4 s`."""
-    place = [row[name] for name in "XYZ"]
-    where = "" if np.isnan(place).any() else f" of ({', '.join(f'{value:g}' for value in place)}) m"
-    return f"{_words(row['what'])}{where} at {row['t']:g} s"
 
 
 def bands_chart(t: np.ndarray, bands: Mapping[str, np.ndarray], levels: Sequence[float]) -> Figure:

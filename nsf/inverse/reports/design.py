@@ -8,14 +8,15 @@ import pandas as pd
 from nsf.deployment.trust import bound_text, percent
 from nsf.errors import ConfigError
 from nsf.inverse.design import Designed, Program, Tilt, design, full_order
-from nsf.inverse.error import ModelError
+from nsf.inverse.fit import ModelError
 from nsf.inverse.observations import View
-from nsf.inverse.reports.charts import program_chart, targets_chart
+from nsf.inverse.reports.charts import program_chart
 from nsf.inverse.reports.page import Chart, Results, frame_table, rms, title_of
 from nsf.results.columns import number
 
 #: Tolerances (RMS) beyond which the targets count as missed.
 _MISSED = 3.0
+_MOST = 20  # targets that the page lists
 _LEAD = "A program of forcing that is to bring a target about, from gradients through runs by recurrence."
 _TERMS = (
     ("off", "root mean square, over the targets, of the target less what a run has."),
@@ -56,21 +57,32 @@ def designing(
     with suppress(ConfigError):  # without validation runs nothing is known of it
         off["the model's own error"] = rms(ModelError.of(view, model).deviations)
     say("design: off by: " + ", ".join(f"{name} {number(1e3 * value)} mm" for name, value in off.items()))
-    ways = dict(zip(program.coordinates.names, designed.values.T, strict=True))
+    ways = dict(zip(program.names, designed.values.T, strict=True))
     table = pd.DataFrame({"": list(off), "off [mm]": [1e3 * value for value in off.values()]})
-    drawn, over = program_chart(model.t, ways, program.coordinates.unit), "The program over time."
-    left, less = targets_chart(rows), "Targets less the values of the runs; a bar is the tolerance."
+    drawn = program_chart(model.t, ways, program.unit)
+    count = f"{len(rows)} target{'s' * (len(rows) != 1)}"
     return Results(
         title=f"{title_of(model)}: design",
         lead=_LEAD,
         models=[model],
-        tables=[frame_table("How far off", table, f"{len(rows)} target{'s' * (len(rows) != 1)}.")],
+        tables=[
+            frame_table("How far off", table, f"{count}."),
+            frame_table("Targets", _shown(rows), f"The first {_MOST} at most [m, s]; targets.csv has all."),
+        ],
         files={"program.csv": pd.DataFrame({"t": model.t} | ways), "targets.csv": rows},
-        charts=[Chart("Program", "program", over, drawn), Chart("Program", "targets", less, left)],
+        charts=[Chart("Program", "program", "The program over time.", drawn)],
         facts=[("Search", designed.stopped), ("Error bound", percent(designed.error_bound))],
         definitions=_TERMS,
         warnings=_warnings(program, designed, rms((rows["value"] - rows["fitted"]) / rows["tolerance"])),
-        settings={"seed": seed, "knots": program.knots, "bounds": program.coordinates.bounds.tolist()},
+        settings={"seed": seed, "knots": program.knots, "bounds": program.bounds.tolist()},
+    )
+
+
+def _shown(rows: pd.DataFrame) -> pd.DataFrame:
+    """The first targets, what they are of before all numbers, without columns that are empty."""
+    first = rows.head(_MOST).dropna(axis=1, how="all")
+    return first[["what", *(name for name in first if name != "what")]].rename(
+        columns=lambda name: name.replace("_", " ")
     )
 
 

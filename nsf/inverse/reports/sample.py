@@ -8,11 +8,10 @@ import pandas as pd
 from nsf.data import Trajectory
 from nsf.inverse.fit import fit
 from nsf.inverse.observations import View
-from nsf.inverse.posterior import Posterior, posterior
 from nsf.inverse.reports.calibration import warnings_of
 from nsf.inverse.reports.charts import bands_chart, indices_chart, posterior_chart
 from nsf.inverse.reports.page import Chart, Problem, Results, frame_table, named, title_of
-from nsf.inverse.sampling import LEVELS, Prior, Runs, Scalars, runs, sensitivities
+from nsf.inverse.sampling import LEVELS, Posterior, Prior, Runs, Scalars, posterior, runs, sensitivities
 from nsf.inverse.space import Space
 from nsf.runs import Run
 

@@ -11,7 +11,7 @@ import torch
 from nsf.errors import ConfigError
 from nsf.inverse import Forcing, Model
 from nsf.inverse.design import Moves, Tilt, design, full_order
-from nsf.inverse.error import ModelError
+from nsf.inverse.fit import ModelError
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.reports.command import calibrate, sample
 from nsf.inverse.reports.command import design as command
@@ -172,7 +172,7 @@ def pushed(pipeline_at, tmp_path_factory):
 
 def test_a_solid_moves_as_in_training(pushed):
     program = Moves(pushed, ("plate",), 3)
-    assert program.coordinates.names[0].startswith("plate along (")
+    assert program.names[0].startswith("plate along (")
     axis = program.tracks["plate"].axes[0]
     np.testing.assert_allclose(np.abs(axis), [1, 0, 0], atol=1e-9)
     values = program.values(torch.ones(1, 3, 1, dtype=torch.float64))
@@ -250,7 +250,7 @@ def test_a_push_is_designed(pushed):
     x = View(empty, pushed).of_runs(run)[0].reshape(1, 2, 3).numpy()
     found = design(program, View(Observations.of_points(t, points, x, 1e-4), pushed), mu)
     assert np.sqrt(found.cost / 6) < 1.0
-    assert full_order(program, found, mu).read("x", [0, 24]).shape == (2, 500, 3)
+    assert full_order(program, found, mu).shape == (25, 500, 3)
 
 
 def test_the_error_of_runs_that_follow_programs(pushed):

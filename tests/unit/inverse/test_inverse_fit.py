@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from nsf.errors import ConfigError
-from nsf.inverse.error import ModelError, Offsets
-from nsf.inverse.fit import fit
+from nsf.inverse.fit import ModelError, Offsets, fit
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.recurrence import with_jacobian
 from nsf.inverse.space import Space

@@ -8,7 +8,7 @@ import nsf
 from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError, ShapeError
 from nsf.inverse import Forcing
-from nsf.inverse.model.inputs import Polynomial
+from nsf.inverse.model import Polynomial
 
 ONE = {"friction_angle": 27.0, "speed": 0.2}
 

@@ -8,12 +8,10 @@ import pytest
 from scipy import stats
 
 from nsf.errors import ConfigError, InstabilityError
-from nsf.inverse.error import ModelError
-from nsf.inverse.fit import fit
+from nsf.inverse.fit import ModelError, fit
 from nsf.inverse.observations import Observations, View
-from nsf.inverse.posterior import Posterior, posterior
 from nsf.inverse.reports.command import sample
-from nsf.inverse.sampling import Prior, Scalars, distribution, runs, sensitivities
+from nsf.inverse.sampling import Posterior, Prior, Scalars, distribution, posterior, runs, sensitivities
 
 
 def test_distributions_are_those_of_scipy():
@@ -119,7 +117,7 @@ def test_a_posterior_is_the_estimate_where_the_prior_is_wide(model, monkeypatch)
     np.testing.assert_allclose(drawn.mean(0), found.estimate, atol=0.3 * found.standard_error.max())
     assert (np.abs(drawn.std(0) / found.standard_error - 1.0) < 0.3).all()
     monkeypatch.setattr(
-        "nsf.inverse.posterior._LENGTH", 10.0
+        "nsf.inverse.sampling._LENGTH", 10.0
     )  # where they lie shows sooner than how they vary
     narrow = posterior(Prior.of(model, {"friction_angle": "norm(33,0.01)"}), view, found, 500).values
     assert narrow[:, 0].mean() > found.estimate[0] + 2 * found.standard_error[0]
