@@ -278,13 +278,11 @@ def _reports(arguments: list[str]) -> int:
 def _search(arguments: list[str]) -> int:
     """Trials until there are enough, and the best of them."""
     words.check("search", arguments)
-    from nsf.pipeline.sweeps.search import best, search
-    from nsf.results.search import best_table
+    from nsf.pipeline.sweeps.search import search
 
-    chart = search(arguments)
-    trials = chart.with_name("trials.csv")
-    screen().print(best_table(trials))
-    print(best(arguments, trials))
+    chart, best, command = search(arguments)
+    screen().print(best)
+    print(command)
     return _open(chart)
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from omegaconf import DictConfig, ListConfig
 
 from nsf import config as configuration
@@ -15,11 +17,15 @@ from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, firs
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.sweeps.outcome import best_text
-from nsf.results.search import OBJECTIVES, write_search
-from nsf.results.table import parsed, read
-from nsf.storage import locked
+from nsf.results.columns import COLUMNS, Column
+from nsf.results.formats import Rows, TerminalTable, spreadsheet
+from nsf.results.style import MUTED, PALETTE, figure, save, styled
+from nsf.results.table import read
+from nsf.storage import locked, writing
 from nsf.words import NUMBER
 
+#: What a search can make small, by the name that a user gives it.
+OBJECTIVES: dict[str, Column] = {"delta": COLUMNS["delta"], "step_ms": COLUMNS["step_ms"]}
 _RANGE = re.compile(rf"(?P<key>[\w./]+)=(?P<low>{NUMBER})\.\.(?P<high>{NUMBER})(?P<log>:log)?")
 
 
@@ -63,7 +69,9 @@ class Range:
         return f"{self.key}={suggest(self.key, self.low, self.high, log=self.log)}"
 
 
-def search(words: Sequence[str], say: Callable[[str], object] = print, root: Path | None = None) -> Path:
+def search(
+    words: Sequence[str], say: Callable[[str], object] = print, root: Path | None = None
+) -> tuple[Path, TerminalTable, str]:
     """Try values until `search.trials` have been tried, and write what came out.
 
     The trials lie in `search.db` in the folder of runs: the same keys go on with the same trials, also from
@@ -75,7 +83,7 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
         root: folder of all runs; NSF_RUNS, else ./runs.
 
     Returns:
-        The chart; `trials.csv` lies in its folder.
+        The chart, in whose folder `trials.csv` lies; the best trials; the command that deploys the best one.
 
     Raises:
         MissingExtraError: Optuna is not installed.
@@ -109,24 +117,19 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
     if not table["pareto"].any():
         raise MissingRunError("no trial of this search has a result; the lines above say why")
     folder = Path(config.report.folder) / f"search_{study.study_name}"
-    return write_search(table, objectives, folder)
+    with writing(folder / "trials.csv") as partial:
+        table.map(spreadsheet).to_csv(partial, index=False)
+    save(_chart(table, objectives), folder, "search")
+    best = _best(table, objectives[0], ranges, fixed)
+    return folder / "search.png", _best_trials(table), best
 
 
-def best(words: Sequence[str], trials: Path) -> str:
-    """The trial of the smallest first objective at the validation values, and the command that deploys it.
-
-    Args:
-        words: as of `search`; trials: the `trials.csv` that it wrote.
-    """
-    ranges, fixed = _parted(words)
-    table = parsed(trials, [r.key for r in ranges])
-    name = next(name for name in table if name in OBJECTIVES)
-    row = table.loc[table[name].idxmin()]
+def _best(table: pd.DataFrame, objective: str, ranges: Sequence[Range], fixed: Sequence[str]) -> str:
+    """The trial of the smallest objective at the validation values, and the command that deploys it."""
+    row, column = table.loc[table[objective].idxmin()], OBJECTIVES[objective]
     tried = [f"{r.key}={row[r.key]}" for r in ranges]
-    words = [word for word in fixed if not word.startswith("search.")]
-    column = OBJECTIVES[name]
-    score = f"{column.title} {column.cell(row[name])} {column.unit}"
-    return best_text(score, tried, [*words, *tried])
+    score = f"{column.title} {column.cell(row[objective])} {column.unit}"
+    return best_text(score, tried, [*(word for word in fixed if not word.startswith("search.")), *tried])
 
 
 def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
@@ -242,3 +245,49 @@ def _table(study, ranges: Sequence[Range], objectives: Sequence[str]) -> pd.Data
         for trial in study.get_trials(states=(TrialState.COMPLETE, TrialState.FAIL))
     ]
     return pd.DataFrame(rows)
+
+
+def _chart(table: pd.DataFrame, objectives: Sequence[str]) -> Figure:
+    """The trials that did not fail: two objectives and their front, or one over the trials."""
+    with styled():
+        fig = figure(4.2)
+        ax = fig.add_subplot()
+        (_front if len(objectives) == 2 else _progress)(ax, table.dropna(subset=list(objectives)), objectives)
+        ax.grid(True)
+        ax.legend()
+    return fig
+
+
+def _best_trials(trials: pd.DataFrame) -> TerminalTable:
+    """The Pareto front, for the terminal."""
+    best = trials[trials["pareto"]].drop(columns=["pareto", "error"])
+    columns = [OBJECTIVES.get(name, Column(name, name)) for name in best]
+    body = [
+        [column.cell(row[name]) for name, column in zip(best, columns, strict=True)]
+        for row in best.to_dict("records")
+    ]
+    return TerminalTable(Rows([column.heading for column in columns], body, [False] * len(columns)))
+
+
+def _front(ax, done: pd.DataFrame, objectives: Sequence[str]) -> None:
+    """Both objectives of every trial, and the front of those that no other trial beats in both."""
+    x, y = objectives
+    shown = done[[x, y]] * [OBJECTIVES[x].scale, OBJECTIVES[y].scale]
+    front = shown[done["pareto"]].sort_values(x)
+    ax.scatter(shown[x], shown[y], s=22, color=MUTED, label="trials")
+    ax.step(front[x], front[y], where="post", color=PALETTE[0], marker="o", label="Pareto front")
+    for at, row in front.iterrows():
+        ax.annotate(f"{done['trial'][at]}", (row[x], row[y]), xytext=(4, 4), textcoords="offset points")
+    ax.set(
+        xlabel=OBJECTIVES[x].heading, ylabel=OBJECTIVES[y].heading, title="Trials at the validation values"
+    )
+
+
+def _progress(ax, done: pd.DataFrame, objectives: Sequence[str]) -> None:
+    """The objective of every trial, and the best until then."""
+    (name,) = objectives
+    shown = done[name] * OBJECTIVES[name].scale
+    ax.scatter(done["trial"], shown, s=22, color=MUTED, label="trials")
+    ax.step(done["trial"], shown.cummin(), where="post", color=PALETTE[0], label="best until then")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set(xlabel="trial", ylabel=OBJECTIVES[name].heading, title="Trials at the validation values")
