@@ -15,7 +15,8 @@ from nsf.inverse.search import nearest
 from nsf.mpm import Motion
 from nsf.recurrence.solids import FEATURES
 from nsf.scenes import Keyframes, Scene
-from nsf.scenes.programs import Programs, across, largest_tilt
+from nsf.scenes.programs import Programs
+from nsf.scenes.tilts import across, largest_tilt
 
 _STARTS = 64  # programs that are tried in one batch
 _HARDLY = 1e-6  # [m] of a solid that does not move

@@ -17,11 +17,12 @@ from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation.metrics import pressure, von_mises
 from nsf.live import page
+from nsf.live.surface import at_surface
 from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
 from nsf.runs import Run
-from nsf.scenes.programs import largest_tilt, tilted
+from nsf.scenes.tilts import largest_tilt, tilted
 
 #: Precision of live runs, whatever the deployment's: a CPU reads half as much a step. On the sand column this
 #: moves no particle by more than a thousandth of the displacement.
@@ -395,14 +396,3 @@ def _shown(X: np.ndarray, sample: np.ndarray, points: int, surface: bool) -> np.
         first = others[outer][: int(_OUTER * left)]
         others = np.concatenate([first, others[~np.isin(others, first)]])
     return np.sort(np.concatenate([sample, others[:left]]))
-
-
-def at_surface(X: np.ndarray) -> np.ndarray:
-    """[P] whether particles X [P, 3] lie in a cell that has an empty one beside it."""
-    extent = np.maximum(np.ptp(X, axis=0), 1e-9)
-    edge = 2.0 * (np.prod(extent) / len(X)) ** (1 / 3)  # some eight particles where they fill their box
-    cells = np.floor((X - X.min(0)) / edge).astype(int) + 1
-    filled = np.zeros(cells.max(0) + 2, bool)
-    filled[tuple(cells.T)] = True
-    sides = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
-    return np.any([~filled[tuple((cells + side).T)] for side in sides], axis=0)

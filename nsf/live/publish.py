@@ -23,7 +23,7 @@ from nsf.recurrence import Form, RecurrenceEngine, first_change
 from nsf.results.formats import file_name
 from nsf.runs import Run
 from nsf.scenes import Scene
-from nsf.scenes.programs import largest_tilt
+from nsf.scenes.tilts import largest_tilt
 from nsf.storage import write_text, writing
 from nsf.vectors import spaced
 

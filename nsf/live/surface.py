@@ -55,3 +55,14 @@ def boundary(X: np.ndarray, radius: float) -> np.ndarray:
     inward = ((X[opposite] - a) * np.cross(b - a, c - a)).sum(axis=1) > 0
     sides[inward] = sides[inward][:, ::-1]
     return sides
+
+
+def at_surface(X: np.ndarray) -> np.ndarray:
+    """[P] whether particles X [P, 3] lie in a cell that has an empty one beside it."""
+    extent = np.maximum(np.ptp(X, axis=0), 1e-9)
+    edge = 2.0 * (np.prod(extent) / len(X)) ** (1 / 3)  # some eight particles where they fill their box
+    cells = np.floor((X - X.min(0)) / edge).astype(int) + 1
+    filled = np.zeros(cells.max(0) + 2, bool)
+    filled[tuple(cells.T)] = True
+    sides = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
+    return np.any([~filled[tuple((cells + side).T)] for side in sides], axis=0)

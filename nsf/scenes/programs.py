@@ -14,6 +14,7 @@ import numpy as np
 from nsf.errors import ConfigError, first_line
 from nsf.mpm import Gravity, Motion
 from nsf.scalars import number
+from nsf.scenes.tilts import across, normalised, tilted
 from nsf.vectors import direction, numbers
 
 #: Keyframes between two knots of a program.
@@ -139,9 +140,9 @@ class Keyframes(GravityProgram):
 
     def of(self, gravity: Gravity, duration: float, generator: np.random.Generator) -> Gravity:
         """See `GravityProgram.of`."""
-        down = _unit(gravity.at(0.0))
+        down = normalised(gravity.at(0.0))
         for t, value in zip(self.times, self.values, strict=True):
-            off = np.degrees(np.arccos(np.clip(down @ _unit(np.array(value)), -1.0, 1.0)))
+            off = np.degrees(np.arccos(np.clip(down @ normalised(np.array(value)), -1.0, 1.0)))
             if np.any(value) and np.any(down) and off > self.angle + 1e-9:
                 raise ConfigError(
                     f"the program's gravity at t = {t:g} s is {off:.3g}° off, beyond angle={self.angle:g}°; "
@@ -333,7 +334,7 @@ class Programs:
     def reach(self, gravity: Sequence[float], duration: float) -> float:
         """How far from the scene's gravity [3] that of any run of some duration [s] may be [m/s²]."""
         base, far = np.asarray(gravity, float), 0.0
-        down = _unit(base) if base.any() else np.array([0.0, 0.0, -1.0])
+        down = normalised(base) if base.any() else np.array([0.0, 0.0, -1.0])
         for change in self.gravity.values():
             far += change.reach(base + far * down, duration)
         return far
@@ -360,26 +361,6 @@ class Programs:
                     f"{where} may reach {speed:.3g} m/s, more than a cell, {dx:.3g} m, a step of {dt:g} s; "
                     "let it be slower, or choose a smaller scene.dt"
                 )
-
-
-def tilted(gravity: np.ndarray, tilt: np.ndarray) -> np.ndarray:
-    """Gravity [n, 3] [m/s²] turned by tilts [n, 2] [rad] along two directions across its first value."""
-    size = np.linalg.norm(gravity, axis=1, keepdims=True)
-    angle = np.linalg.norm(tilt, axis=1, keepdims=True)
-    aside = tilt @ across(gravity[0])
-    return size * (np.cos(angle) * _unit(gravity) + np.sinc(angle / np.pi) * aside)
-
-
-def largest_tilt(gravity: np.ndarray, middle: np.ndarray, reach: float) -> float:
-    """Largest angle [rad] by which gravity [3] may tilt either way and stay within a ball [3] [m/s²].
-
-    Tilted by θ away from the middle m it is off by |g|² + |m|² − 2 |g| |m| cos(θ + φ), squared, with φ the
-    angle between both.
-    """
-    size, around = np.linalg.norm(gravity), max(float(np.linalg.norm(middle)), 1e-30)
-    between = np.arccos(np.clip(gravity @ middle / (size * around), -1.0, 1.0))
-    cosine = (size**2 + around**2 - reach**2) / (2.0 * size * around)
-    return max(0.0, float(np.arccos(np.clip(cosine, -1.0, 1.0)) - between))
 
 
 def _check_made(group: str, name: str, program: object, made: object, kind: type) -> None:
@@ -415,17 +396,3 @@ def _wandering(duration: float, knots: int, generator: np.random.Generator) -> t
     times = np.linspace(0.0, duration, _KEYFRAMES * knots + 1)
     way = _through(passed, times, duration)
     return times, way / np.maximum(1.0, np.linalg.norm(way, axis=1, keepdims=True))
-
-
-def _unit(values: np.ndarray) -> np.ndarray:
-    """Vectors [..., 3] of length 1; zero stays zero."""
-    size = np.linalg.norm(values, axis=-1, keepdims=True)
-    return values / np.where(size > 0.0, size, 1.0)
-
-
-def across(gravity: np.ndarray) -> np.ndarray:
-    """[2, 3] unit vectors across gravity [3]: x and y where it points along z."""
-    down = _unit(gravity) if np.any(gravity) else np.array([0.0, 0.0, -1.0])
-    axis = np.eye(3)[0 if abs(down[0]) < 0.9 else 1]
-    one = _unit(axis - (axis @ down) * down)
-    return np.stack([one, np.cross(-down, one)])

@@ -20,8 +20,8 @@ from nsf.cli import main
 from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError
 from nsf.live import demo, publish
-from nsf.live.model import LiveModel, at_surface
-from nsf.live.surface import surface
+from nsf.live.model import LiveModel
+from nsf.live.surface import at_surface, surface
 from nsf.storage import write_text
 
 WEB = Path(__file__).parents[1] / "web"
