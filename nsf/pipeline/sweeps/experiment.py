@@ -1,6 +1,7 @@
 """Experiments: a question, and the jobs that answer it (one file each in `experiments/`)."""
 
 import difflib
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import yaml
 from omegaconf import DictConfig
 
 from nsf import config as configuration
+from nsf.canonical import content_hash
 from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import experiments, groups, option, reports_folder
@@ -23,6 +25,8 @@ _OPTIONAL = {"stages", "each", "printed", "plots"}
 _KEYS_OF_PARTS = {"title", "question", "parts"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 _MEASURING = "evaluation."  # keys of how runs are measured, which tell no two models apart
+_WORKING = ("device", "tracking", "data.keep", "data.resident", "report.folder")  # keys that change no result
+_LONGEST = 80  # characters of overrides in the name of a folder
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,8 @@ class Experiment:
         printed: δ that the paper prints of single jobs, as `Question` has them; None where it prints one a
             scene and method, which the scene's file has.
         placed: whether the command line says where the report goes.
-        small: whether the file itself asks for scale=small, so that its report's name need not say so.
+        changes: overrides of the command line by which the jobs differ from the file's, in order; the name
+            and the title of the report have them, so that it never replaces one of the file's jobs.
         parts: experiments with questions, jobs and reports of their own; none where the file has jobs itself.
     """
 
@@ -68,7 +73,7 @@ class Experiment:
     stages: tuple[str, ...] = ()
     printed: tuple[dict, ...] | None = None
     plots: tuple[str, ...] | None = None
-    small: bool = False
+    changes: tuple[str, ...] = ()
     placed: bool = False
     parts: "tuple[Experiment, ...]" = ()
 
@@ -121,13 +126,18 @@ class Experiment:
         for grid in stated:
             _check_options(grid, replaced, where)
         grids = tuple(grid | replaced for grid in stated)
-        small = all(grid.get("scale") == "scale=small" for grid in stated)
+        changes = [
+            override
+            for key, override in replaced.items()
+            if key not in _WORKING and any(grid.get(key) != override for grid in stated)
+        ]
+        changes.sort(key=lambda override: (override.startswith(_MEASURING), override))
         texts = _texts(content, ("title", "question", "paper"), where)
         printed, plots = _printed(content.get("printed"), where), content.get("plots")
         if plots is not None and not (isinstance(plots, list) and all(isinstance(p, str) for p in plots)):
             raise ConfigError(f"{where}: plots={plots} must be a list of names of charts")
         return cls(
-            name=name, grids=grids, stages=tuple(stages), printed=printed, small=small,
+            name=name, grids=grids, stages=tuple(stages), printed=printed, changes=tuple(changes),
             placed="report.folder" in replaced, plots=None if plots is None else tuple(plots), **texts,
         )  # fmt: skip
 
@@ -154,7 +164,7 @@ class Experiment:
             return self._reports_of_parts(say, root)
         runs: dict[str, Run] = {}
         fine: dict[str, Run] = {}
-        keys, missing, scales = {}, [], set()
+        keys, missing = {}, []
         for job in self.jobs:
             config = configuration.load(job.overrides)
             pipeline = Pipeline(config, root=root)
@@ -164,7 +174,6 @@ class Experiment:
                 missing.append(f"{' '.join(job.overrides)}: {_why(pipeline)}")
                 continue
             runs[run.id], keys[run.id] = run, job.keys
-            scales.add(config.scale)
             if "superresolve" in self.stages:
                 try:
                     fine[run.id] = pipeline.evaluated("superresolve")
@@ -175,12 +184,13 @@ class Experiment:
             raise MissingRunError(
                 f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
             )
-        folder = self._folder(config, scales)
+        folder = self._folder(config)
+        changed = f", with {' '.join(self.changes)}" if self.changes else ""
         question = Question(
-            folder.relative_to(config.report.folder).as_posix(), self.title, self.question, self.paper,
-            keys, self.printed, missing, fine, self.plots,
+            folder.relative_to(config.report.folder).as_posix(), f"{self.title}{changed}", self.question,
+            self.paper, keys, self.printed, missing, fine, self.plots,
         )  # fmt: skip
-        said = f"report: {len(runs)} jobs, {len(missing)} missing"
+        said = f"report: {len(runs)} jobs, {len(missing)} missing{changed}"
         if page := unchanged(folder, runs.values(), question):
             say(f"{said}, unchanged, reused → {page}")
             return page, missing
@@ -217,16 +227,21 @@ class Experiment:
         from nsf.results.folder import check_place
 
         for one in self.parts or (self,):
-            config = configuration.load(one.jobs[0].overrides)
-            check_place(one._folder(config, {config.scale}))
+            check_place(one._folder(configuration.load(one.jobs[0].overrides)))
 
-    def _folder(self, config: DictConfig, scales: set[str]) -> Path:
+    def _folder(self, config: DictConfig) -> Path:
         from nsf.results.folder import check_inside
 
-        shrunk = scales == {"small"} and not self.small
         if not self.placed:
             check_inside(config.report.folder, reports_folder())
-        return Path(config.report.folder) / (f"{self.name}_small" if shrunk else self.name)
+        return Path(config.report.folder) / "_".join((self.name, *_short(self.changes)))
+
+
+def _short(changes: Sequence[str]) -> list[str]:
+    """Overrides as part of the name of a folder; what could be no name, or is long, ends in a hash."""
+    text = ",".join(changes)
+    plain = re.sub(r"[^\w.,=+-]", "-", text, flags=re.ASCII)[:_LONGEST]
+    return [plain if plain == text else f"{plain}-{content_hash(list(changes))}"] if changes else []
 
 
 def questions(folder: Path | None = None) -> dict[str, dict[str, str]]:

@@ -115,10 +115,9 @@ class Reports:
 
     def place(self, name: str) -> tuple[int, str, int, str]:
         """Number and heading of a report's chapter, its place in there, and its name."""
-        whole = name.removesuffix("_small")
         chapters = self.contents["chapters"]
         for number, (heading, names) in enumerate(chapters.items()):
-            for one in (whole, whole.partition("/")[0]):
+            for one in (name, name.partition("/")[0]):
                 if one in names:
                     return number, heading, names.index(one), name
         return len(chapters) - 1, list(chapters)[-1], 0, name

@@ -190,3 +190,38 @@ def test_keys_of_another_part_refuse_no_option(tmp_path):
     assert Experiment.load("one/first", ["model=interpolate"], tmp_path).jobs
     with pytest.raises(ConfigError, match=r"second sets model\.runs"):
         Experiment.load("one", ["model=interpolate"], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "same"),
+    [
+        ([], True),
+        (["device=cpu", "data.keep=held_out", "tracking=none"], True),  # how, not what, is computed
+        (["scale=small"], True),  # as in the file
+        (["scale=paper"], False),
+        (["stress=deformation"], False),
+        (["sampler=random"], False),  # fewer jobs
+        (["evaluation.trials=0"], False),  # a report without times
+    ],
+)
+def test_jobs_of_other_settings_have_a_report_of_their_own(written, tmp_path, monkeypatch, overrides, same):
+    monkeypatch.setenv("NSF_REPORTS", str(tmp_path))
+    places = []
+    monkeypatch.setattr("nsf.results.folder.check_place", lambda folder: places.append(folder.name))
+    written(TEXT, *overrides).check_report_folder()
+    assert (places == ["one"]) == same
+    if not same:
+        assert places == [f"one_{overrides[0]}"]
+
+
+def test_names_of_reports_differ_where_their_settings_do(written, tmp_path, monkeypatch):
+    monkeypatch.setenv("NSF_REPORTS", str(tmp_path))
+    places = []
+    monkeypatch.setattr("nsf.results.folder.check_place", places.append)
+    several = [["scene.steps=5", "seed=1"], ["seed=1", "scene.steps=5"], ["seed=1,2"]]
+    lists = [[f"scene.design.train=[{train}]"] for train in ("20,30", "'20,30'", ",".join(["20"] * 90))]
+    for overrides in several + lists:
+        written(TEXT, *overrides).check_report_folder()
+    assert len(set(places)) == len(places) - 1  # the order of overrides is no setting
+    assert {place.parent for place in places} == {tmp_path}
+    assert max(len(place.name) for place in places) < 120
