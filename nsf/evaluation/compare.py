@@ -16,10 +16,10 @@ from nsf.dynamics import Decoder, ReducedMPM
 from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
-from nsf.evaluation.quantities import QUANTITIES, at_end, height
 from nsf.evaluation.surroundings import surroundings
 from nsf.kinematics.blocks import frames_at_once
 from nsf.mpm.grid.shape import DEGREES
+from nsf.quantities import QUANTITIES, at_end, height
 from nsf.vectors import at_times, spaced
 
 _VALUES = 90  # of a particle and frame that are held together: x, v, C and τ of three kinds

@@ -14,11 +14,11 @@ from torch import Tensor
 from nsf import words
 from nsf.data import Trajectory
 from nsf.errors import ConfigError, InstabilityError
-from nsf.evaluation.quantities import QUANTITIES
 from nsf.extras import optional
+from nsf.inverse.columns import check_scalars
 from nsf.inverse.fit import Fit
 from nsf.inverse.model import Forcing, Model
-from nsf.inverse.observations import Observations, View, is_scalar
+from nsf.inverse.observations import Observations, View
 from nsf.inverse.space import Space
 from nsf.vectors import spaced
 
@@ -139,11 +139,7 @@ class Scalars:
     """
 
     def __init__(self, names: Sequence[str], model: Model):
-        if wrong := [name for name in names if not is_scalar(name)]:
-            raise ConfigError(
-                f"of={wrong[0]} is none of {', '.join(QUANTITIES)}, nor a component of a point at rest, as "
-                "z@0.5:0.5:0.2"
-            )
+        check_scalars(names)
         self.names, looks = tuple(dict.fromkeys(names)), spaced(len(model.t), _TIMES)
         self.t = model.t[looks]
         every = Observations.of_scalars(dict.fromkeys(self.names, 0.0), self.t)

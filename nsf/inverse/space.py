@@ -8,28 +8,11 @@ import torch
 from torch import Tensor
 
 from nsf.errors import ConfigError
+from nsf.inverse.call import check_taught
 from nsf.inverse.model import Model
 
 #: Deviation of a value of which nothing is known but its range, in units of the range.
 UNKNOWN = 12.0**-0.5
-
-
-def check_taught(model: Model, name: str, low: float, high: float) -> None:
-    """Refuse a range of a parameter, or a value as both its ends, that the recurrence was not taught.
-
-    Raises:
-        ConfigError: its ends are the wrong way round, or one lies outside.
-    """
-    if low > high:
-        raise ConfigError(f"{name}={low:g}..{high:g} is the wrong way round; give {name}={high:g}..{low:g}")
-    least, most = model.ranges.tolist()[model.names.index(name)]
-    slack = 1e-9 * max(abs(least), abs(most))
-    if not least - slack <= low <= high <= most + slack:
-        text = f"{low:g}" if low == high else f"{low:g}..{high:g}"
-        raise ConfigError(
-            f"{name}={text} goes beyond what was taught, {least:g}..{most:g}; stay within, or train with a "
-            "wider range"
-        )
 
 
 @dataclass(frozen=True)
@@ -64,7 +47,7 @@ class Space:
             name: list(map(float, stated.get(name, taught[name]))) for name in taught if name not in fixed
         }
         for name, (low, high) in [*ranges.items(), *((name, (v, v)) for name, v in fixed.items())]:
-            check_taught(model, name, low, high)
+            check_taught(name, low, high, *taught[name])
         if empty := [name for name, (low, high) in ranges.items() if low == high]:
             raise ConfigError(f"{empty[0]} has an empty range; give {empty[0]}={ranges[empty[0]][0]:g}")
         if not ranges:

@@ -1,6 +1,5 @@
 """Observations of one run: points of the body over time, and scalars of its shape."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,33 +12,19 @@ from torch import Tensor
 
 from nsf.data import Trajectory
 from nsf.errors import ConfigError
-from nsf.evaluation.quantities import QUANTITIES
+from nsf.inverse.columns import AXES, COLUMNS, component, read_columns
 from nsf.inverse.model import Model
-from nsf.inverse.observations.columns import COLUMNS, read_columns
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Restriction
+from nsf.quantities import QUANTITIES
 from nsf.vectors import drawn
-from nsf.words import NUMBER
 
 _Positions = Callable[[np.ndarray], Tensor]
-AXES = ("x", "y", "z")
 _POINT = ("X", "Y", "Z")
-_COMPONENT = re.compile(rf"([xyz])@({NUMBER}):({NUMBER}):({NUMBER})")
 #: Particles that a scalar of a shape is taken from.
 BODY = 1000
 #: Of Δt: how far a time may be outside of a run.
 _SAME_TIME = 1e-6
-
-
-def component(text: str) -> tuple[str, np.ndarray] | None:
-    """Axis and rest position [3] [m] of a component of a point, as `z@0.5:0.5:0.2`; None of another text."""
-    match = _COMPONENT.fullmatch(text)
-    return (match[1], np.array(match.groups()[1:], float)) if match else None
-
-
-def is_scalar(text: str) -> bool:
-    """Whether a text names a quantity, or a component of a point."""
-    return text in QUANTITIES or component(text) is not None
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from nsf.data import Case
 from nsf.deployment import FULL_ORDER, Rollout
 from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution
-from nsf.evaluation.quantities import QUANTITIES
 from nsf.evaluation.surroundings import surroundings
 from nsf.models import describe
+from nsf.quantities import QUANTITIES
 from nsf.results.columns import EVALUATED
 from nsf.runs import Record
 from nsf.runs.provenance import provenance

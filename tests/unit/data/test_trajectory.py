@@ -17,7 +17,7 @@ from nsf.data.schema import COMPONENTS, packed
 from nsf.data.sink import Sink
 from nsf.deployment import Rollout
 from nsf.errors import InstabilityError, MissingRunError, SchemaError, ShapeError, StorageError
-from nsf.inverse.observations.columns import read_columns
+from nsf.inverse.columns import read_columns
 
 
 def stacked(values, field):

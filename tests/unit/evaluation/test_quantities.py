@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nsf.evaluation.quantities import QUANTITIES, at_end, height, opening, run_out, springback
+from nsf.quantities import QUANTITIES, at_end, height, opening, run_out, springback
 
 
 @pytest.fixture

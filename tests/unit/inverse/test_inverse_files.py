@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 
 from nsf.errors import ConfigError
+from nsf.inverse.call import ranges_of
 from nsf.inverse.observations import Observations, View
-from nsf.inverse.reports.command import calibrate, ranges_of
+from nsf.inverse.reports.command import calibrate
 from nsf.results.committed import faults, write_list
 
 POINT = {"t": 0.1, "particle": 5, "x": 0.5, "z": 0.2, "deviation": 1e-3}

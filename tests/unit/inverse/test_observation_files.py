@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from nsf.errors import NSFError
-from nsf.inverse.observations import Observations, columns
+from nsf.inverse import columns
+from nsf.inverse.observations import Observations
 
 MODEL = SimpleNamespace(t=np.linspace(0.0, 1.0, 11), manifold=SimpleNamespace(X=torch.zeros(100, 3)))
 HEAD, ROW = "t,particle,x,deviation", "0.1,5,0.5,1e-3"

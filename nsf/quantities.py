@@ -1,10 +1,13 @@
 """Scalars of a body's shape that can be measured with a ruler: pure functions, differentiable, in metres."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:  # the names of quantities are there without torch
+    from torch import Tensor
 
 #: Share of the particles whose mean is an end of the body: one particle would be noise.
 _END = 0.01
@@ -43,7 +46,7 @@ def opening(x: Tensor, X: Tensor) -> Tensor:
         x, X: as for `height`.
     """
     axis = int((X.amax(0) - X.amin(0)).argmax())
-    return torch.diff(x[..., axis].sort(-1).values, dim=-1).amax(-1)
+    return x[..., axis].sort(-1).values.diff(dim=-1).amax(-1)
 
 
 def springback(x: Tensor, X: Tensor) -> Tensor:

@@ -1,9 +1,13 @@
-"""Columns of a file of observations, CSV or HDF5: sizes are bounded before reading, nothing is lost."""
+"""Columns of a file of observations, CSV or HDF5: sizes are bounded before reading, nothing is lost.
+
+Nothing here imports torch, so that a file is refused before it is loaded.
+"""
 
 import gzip
 import io
 import itertools
 import os
+import re
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +18,11 @@ import pandas as pd
 
 from nsf.data import hdf5, heaps
 from nsf.errors import ConfigError, SchemaError, first_line
+from nsf.quantities import QUANTITIES
+from nsf.words import NUMBER
 
+AXES = ("x", "y", "z")
+_COMPONENT = re.compile(rf"([xyz])@({NUMBER}):({NUMBER}):({NUMBER})")
 COLUMNS = ("t", "particle", "X", "Y", "Z", "x", "y", "z", "quantity", "value", "deviation")
 _MOST_ROWS = 1_000_000
 _MOST_BYTES = 2**28  # of a file, and of the text that is packed in it
@@ -22,6 +30,30 @@ _HEAD = 4096  # letters of the line of names
 _TEXT_BYTES = 64  # of a quantity's name
 _HDF5 = (".h5", ".hdf5")
 _MISSING = ("", "nan", "na")
+
+
+def component(text: str) -> tuple[str, np.ndarray] | None:
+    """Axis and rest position [3] [m] of a component of a point, as `z@0.5:0.5:0.2`; None of another text."""
+    match = _COMPONENT.fullmatch(text)
+    return (match[1], np.array(match.groups()[1:], float)) if match else None
+
+
+def is_scalar(text: str) -> bool:
+    """Whether a text names a quantity, or a component of a point."""
+    return text in QUANTITIES or component(text) is not None
+
+
+def check_scalars(names: Sequence[str]) -> None:
+    """Refuse what is no scalar.
+
+    Raises:
+        ConfigError: names the first such text.
+    """
+    if wrong := [name for name in names if not is_scalar(name)]:
+        raise ConfigError(
+            f"of={wrong[0]} is none of {', '.join(QUANTITIES)}, nor a component of a point at rest, as "
+            "z@0.5:0.5:0.2"
+        )
 
 
 def read_columns(path: Path | str) -> dict[str, np.ndarray]:
