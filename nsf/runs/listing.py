@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from nsf.errors import ConfigError
+from nsf.manifest import STATUSES
 from nsf.paths import groups, option
 from nsf.runs.run import Run
 
@@ -28,6 +29,8 @@ ABSENT = "–"
 #: Groups whose option a run's settings tell, by the class that they name.
 _GROUPS = ("field", "trainer", "sampler", "projector", "integration")
 _GENERATIONS = 32  # of runs, each made from the one before; a chain has five
+_STAGES = ("simulate", "train", "encode", "teach", "deploy", "evaluate", "superresolve")
+_MOST = 8  # values that a sentence names
 ORIGIN = ("commit", "dirty", "device", "seed", "precision", "versions")
 
 
@@ -98,11 +101,14 @@ def entries(
         root: folder of all runs; NSF_RUNS, else ./runs.
 
     Raises:
-        ConfigError: there are runs, and none has such a key; names the nearest.
+        ConfigError: there are runs, and none has such a key; or no run can have such a value of a field or a
+            group. Names those that there are.
     """
     cache: dict[Run, dict[str, Any]] = {}
     chosen = [Entry(run, cache) for run in Run.find(root=root)]
     key = sort.removeprefix("-")
+    for name, wanted in (filters or {}).items():
+        _check_value(name, wanted, chosen)
     for name in (*(filters or ()), key):
         _check_key(name, chosen)
     for name, wanted in (filters or {}).items():
@@ -164,6 +170,37 @@ def _check_key(key: str, listed: Sequence[Entry]) -> None:
     near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"choose {', '.join(FIELDS)}, a metric or a key"
     raise ConfigError(f"no run has {key!r}; {hint}")
+
+
+def _check_value(key: str, wanted: str, listed: Sequence[Entry]) -> None:
+    """Refuse a value that no run can have, of keys whose values are known."""
+    fields = {"stage": _STAGES, "status": (*STATUSES, "killed", "incomplete", "broken", "missing")}
+    if (values := fields.get(key) or groups().get(key)) is None:
+        return
+    values = list(dict.fromkeys([*values, *_values(key, listed)]))
+    for pattern in wanted.split(","):
+        if not any(fnmatchcase(value, pattern) for value in values):
+            raise ConfigError(f"no run can have {key}={pattern}; choose {', '.join(values)}")
+
+
+def _values(key: str, listed: Sequence[Entry]) -> list[str]:
+    """The values that runs have of a key, as shown, each once."""
+    values = (value_of(entry, key) for entry in listed)
+    each = (one for value in values for one in (value if isinstance(value, tuple) else (value,)))
+    return list(dict.fromkeys(text(one) for one in each if one is not None))
+
+
+def why_none(filters: Mapping[str, str], root: Path | None = None) -> str:
+    """A sentence on filters that no run passes: there is none at all, or which filter leaves none."""
+    if not (every := entries(root=root)):
+        return "no runs yet; `nsf run scene=sand` makes some, and NSF_RUNS names another folder"
+    none = f"none of {len(every)} runs has"
+    for key, wanted in filters.items():
+        if not any(_matches(value_of(entry, key), wanted) for entry in every):
+            values = _values(key, every)
+            more = f" and {len(values) - _MOST} more" if len(values) > _MOST else ""
+            return f"{none} {key}={wanted}; they have {', '.join(values[:_MOST])}{more}"
+    return f"{none} all of {' '.join(f'{key}={wanted}' for key, wanted in filters.items())}"
 
 
 def value_of(entry: Entry, key: str):

@@ -9,7 +9,7 @@ from nsf import words
 from nsf.errors import ConfigError, StorageError
 from nsf.runs import Run
 from nsf.runs.columns import table
-from nsf.runs.listing import FIELDS, Entry, entries, text
+from nsf.runs.listing import FIELDS, Entry, entries, text, why_none
 from nsf.runs.pruning import dependents, older, prunable, remove
 from nsf.storage import bytes_text, size_of
 from nsf.terminal import screen
@@ -84,13 +84,14 @@ def main(arguments: Sequence[str]) -> int:
     named = [*filters, *([sort.removeprefix("-")] if sort else [])]
     if formats:
         print(_written(table(runs, named), formats[-1]), end="")
-    else:
+    elif runs:
         from nsf.results.overview.tables import runs_table  # rich takes 0.1 s
 
         page = screen()
         page.print(runs_table(runs, named, page.width))
     _say(f"broken: {entry.run.path}: {entry.fault}" for entry in runs if entry.fault)
-    _say([f"{len(runs)} runs" + ("" if arguments else ", of which `nsf runs --help` says more")])
+    more = "" if arguments else ", of which `nsf runs --help` says more"
+    _say([f"{len(runs)} runs{more}" if runs else why_none(filters)])
     return 0
 
 

@@ -7,6 +7,7 @@ import sys
 import pytest
 from rich.console import Console
 
+from nsf.cli import main
 from nsf.errors import ConfigError
 from nsf.results.overview.tables import difference_table
 from nsf.runs import Run
@@ -95,6 +96,36 @@ def test_an_unknown_key_names_the_nearest(root):
 
 def test_no_runs_at_all(tmp_path):
     assert entries(root=tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "quoted"),
+    [
+        (["stage=foo"], 2, "no run can have stage=foo; choose simulate, train"),
+        (["status=complete,done"], 2, "status=done; choose running, complete"),
+        (["model=recurence"], 2, "no run can have model=recurence; choose auto"),
+        (["stage=deploy"], 0, "none of 8 runs has stage=deploy; they have"),
+        (["latent_dim=7"], 0, "none of 8 runs has latent_dim=7; they have"),
+        (["stage=evaluate", "latent_dim=8"], 0, "none of 8 runs has all of stage=evaluate latent_dim=8"),
+        (["latent_dim=7", "--csv"], 0, "none of 8 runs has latent_dim=7"),
+        (["prune", "stage=foo", "yes=true"], 2, "no run can have stage=foo"),
+    ],
+)
+def test_a_filter_that_no_run_passes(root, monkeypatch, capsys, words, code, quoted):
+    monkeypatch.setenv("NSF_RUNS", str(root))
+    with pytest.raises(SystemExit) as ended:
+        main(["runs", *words])
+    assert ended.value.code == code
+    printed = capsys.readouterr()
+    assert quoted in printed.err
+    assert not printed.out or "--csv" in words
+
+
+def test_no_runs_yet(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    with pytest.raises(SystemExit) as ended:
+        main(["runs"])
+    assert (ended.value.code, capsys.readouterr().out) == (0, "")
 
 
 def test_what_differs(root):
