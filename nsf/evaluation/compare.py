@@ -3,14 +3,12 @@
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.data.schema import COMPONENTS
 from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.dynamics.setup import Setup
@@ -18,11 +16,16 @@ from nsf.errors import SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.surroundings import surroundings
 from nsf.kinematics.blocks import frames_at_once
-from nsf.mpm.grid.shape import DEGREES
 from nsf.quantities import QUANTITIES, at_end, height
 from nsf.vectors import at_times, spaced
 
-_VALUES = 90  # of a particle and frame that are held together: x, v, C and τ of three kinds
+_VALUES = 40  # of a particle and frame that are held together: x and τ of three kinds
+#: Errors of runs, and the squares that they are ratios of.
+_OF_RUNS = {
+    "delta": ("x_error", "x_norm"),
+    "displacement_error": ("x_error", "u_norm"),
+    "stress_error": ("tau_error", "tau_norm"),
+}
 _SAME_TIME = 1e-9  # [s]
 _HARDLY = 1e-4  # of the most in a run
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # entries xx, xy, xz, yy, yz, zz of a symmetric matrix
@@ -84,9 +87,9 @@ def compare(
     """Errors of a rollout against the trajectory of the same case.
 
     Args:
-        solver: the reduced solver of the rollout: it says where τ and C come from. Where particles
-            carried them, in a run of its own steps at the scene's Δt to the end, it takes the run once more;
-            else the fields count.
+        solver: the reduced solver of the rollout: it says where τ comes from. Where particles carried it,
+            in a run of its own steps at the scene's Δt to the end, it takes the run once more; else the
+            fields count.
         trajectory: the full-order run.
         rollout: the reduced run.
         split: `test`, `validation` or `train`.
@@ -98,128 +101,110 @@ def compare(
         SchemaError: the trajectory is of other particles, or the frames of the full-order solver are missing.
         InstabilityError: an error is not finite, though the run did not diverge.
     """
-    scene, manifold, setup = solver.scene, solver.manifold, solver.setup
-    device, parameters = setup.torch_device, setup.parameters
+    manifold, setup = solver.manifold, solver.setup
+    device = setup.torch_device
     manifold.check_particles(trajectory.x_sha256)
     if manifold.X.device != device:  # frames are encoded where they are
         manifold = copy.deepcopy(manifold).to(device)
-    decoder = solver.decoder()
-    frames = trajectory.frames
-    xhat = at_frames(rollout, trajectory.t)
-    diverged = rollout.diverged >= 0
-    # Frames up to the last good step: those after it lie between a good latent and a lost one.
-    last = rollout.t[rollout.diverged - 1] if diverged else np.inf
-    good = trajectory.t <= last + _SAME_TIME
-    xhat[~good] = xhat[good][-1]  # pictures of a diverged run hold its last state; its errors are ∞
-    if rollout.by == FULL_ORDER and (taken is None or taken.frames != frames):
+    if rollout.by == FULL_ORDER and (taken is None or taken.frames != trajectory.frames):
         raise SchemaError(
-            f"the full-order solver took the run at {rollout.case.named}, and its {frames} frames are not "
-            "there; deploy again"
+            f"the full-order solver took the run at {rollout.case.named}, and its {trajectory.frames} frames "
+            "are not there; deploy again"
         )
 
     def tensor(values) -> torch.Tensor:
         # To the device before the wider type: half the bytes travel, and the device converts.
         return torch.as_tensor(np.asarray(values)).to(device).to(setup.dtype)
 
-    before = at_frames(rollout, trajectory.t - trajectory.dt)
-    before[~good] = xhat[~good]
-    xhat, before, X, mass = map(tensor, (xhat, before, trajectory.X, trajectory.mass))
-    rate = (xhat - before) / trajectory.dt
-    rate[0] = solver.first_rate
+    xhat, good = _until_lost(rollout, trajectory.t)
+    xhat, X, decoder = tensor(xhat), tensor(trajectory.X), solver.decoder()
     stress = None if rollout.stress is None else tensor(at_times(trajectory.t, rollout.t, rollout.stress))
-    latents = _Latents(xhat, before, rate, stress, trajectory.dt)
-    inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
-    shown_frames = spaced(frames, pictures[1])
-    samples = {n: _sample_at(solver, trajectory.t[n]) for n in shown_frames}
-    shown_particles = _shown(trajectory.particles, pictures[0], np.concatenate(list(samples.values())))
-    kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")}
-    rows: dict[str, list] = {}
-
-    def note(**values: torch.Tensor) -> None:
-        for name, value in values.items():
-            rows.setdefault(name, []).append(value.cpu())
-
+    shown, rows = _Pictures(solver, trajectory, *pictures), {}
     carried = _Carried(solver, trajectory.every) if _carries(solver, rollout, trajectory) else None
     per_chunk = frames_at_once(_VALUES * trajectory.particles, setup.dtype, device)
-    for start in range(0, frames, per_chunk):
-        block = slice(start, min(start + per_chunk, frames))
-        x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
-        C = C.view(*C.shape[:2], 3, 3)
-        x_rom, v_rom, C_rom, tau_rom = (
-            _read(taken, block, x) if taken else _reduced_fields(decoder, latents.rows(block), carried)
-        )
-        if start == 0:
-            v_rom[0] = v[0]
+    for start in range(0, trajectory.frames, per_chunk):
+        block = slice(start, min(start + per_chunk, trajectory.frames))
+        x, tau = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau"))
+        if taken:
+            x_rom, tau_rom = (tensor(taken.read(name, frames=block)) for name in ("x", "tau"))
+        else:
+            x_rom, tau_rom = _fields(decoder, xhat[block], None if stress is None else stress[block], carried)
         encoded = manifold.encode(x).to(setup.dtype)
-        x_rec, tau_rec = decoder.position(encoded), decoder.at.stress(encoded, parameters)
-        note(
-            x_error=metrics.frame_squares(x_rom - x),
-            x_norm=metrics.frame_squares(x),
-            u_norm=metrics.frame_squares(x - X),
-            tau_error=metrics.tensor_squares(tau_rom - tau),
-            tau_norm=metrics.tensor_squares(tau),
-            rec_error=metrics.frame_squares(x_rec - x),
-            rec_tau_error=metrics.tensor_squares(tau_rec - tau),
-            p_rom=metrics.linear_momentum(v_rom, mass),
-            p_fom=metrics.linear_momentum(v, mass),
-            p_scale=(v.norm(dim=2) * mass).sum(1),
-            L_rom=metrics.angular_momentum(x_rom, v_rom, C_rom, mass, inertia),
-            L_fom=metrics.angular_momentum(x, v, C, mass, inertia),
-            L_scale=(x.norm(dim=2) * v.norm(dim=2) * mass).sum(1),
-            height_rom=height(x_rom, X),
-            height_fom=height(x, X),
-            encoded=encoded,
-        )
-        inside = [n - start for n in shown_frames if block.start <= n < block.stop]
-        for name, values in (
-            ("x_full", x),
-            ("x_reduced", x_rom),
-            ("stress_full", tau),
-            ("stress_reduced", tau_rom),
-        ):
-            shown = values[inside][:, shown_particles]
-            shown = metrics.von_mises(shown) if name.startswith("stress") else shown
-            kept[name].append(shown.float().cpu().numpy())
-        roles = [_roles(setup, x_rom[n], samples[start + n])[shown_particles] for n in inside]
-        kept["role"].append(np.array(roles, np.int8).reshape(len(inside), len(shown_particles)))
+        noted = _squares(x, tau, x_rom, tau_rom, X)
+        x_rec, tau_rec = decoder.position(encoded), decoder.at.stress(encoded, setup.parameters)
+        noted |= {
+            "rec_error": metrics.frame_squares(x_rec - x),
+            "rec_tau_error": metrics.tensor_squares(tau_rec - tau),
+            "height_rom": height(x_rom, X),
+            "height_fom": height(x, X),
+            "encoded": encoded,
+        }
+        for name, values in noted.items():
+            rows.setdefault(name, []).append(values.cpu())
+        shown.take(block, x, tau, x_rom, tau_rom)
         advance(block.stop - block.start)
-
     column = {name: torch.cat(values) for name, values in rows.items()}
+    errors = _totals(column, rollout, len(X))
+    ends = [at_end(column[f"height_{of}"], shape[-1], X) for of, shape in (("rom", x_rom), ("fom", x))]
+    diverged = rollout.diverged >= 0
+    if taken:
+        xhat[:] = torch.nan  # full-order frames are no latent vectors
+    return Comparison(
+        **errors,
+        quantities={name: np.inf if diverged else ends[0][name] - ends[1][name] for name in QUANTITIES},
+        series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
+        pictures=shown.arrays | surroundings(solver.scene, shown.arrays["t"]),
+    )
 
-    def total(error: str, norm: str) -> float:  # over frames 1..N
+
+def _until_lost(rollout: Rollout, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Latent vectors [F, r] at frames, those after a run was lost as the last good one, and which are good.
+
+    Frames are good up to the last good step: those after it lie between a good latent vector and a lost one.
+    """
+    xhat = at_frames(rollout, t)
+    last = rollout.t[rollout.diverged - 1] if rollout.diverged >= 0 else np.inf
+    good = t <= last + _SAME_TIME
+    xhat[~good] = xhat[good][-1]
+    return xhat, good
+
+
+def _squares(x, tau, x_rom, tau_rom, X) -> dict[str, torch.Tensor]:
+    """Sums of squares [F] over particles, of differences and of what these are held to."""
+    return {
+        "x_error": metrics.frame_squares(x_rom - x),
+        "x_norm": metrics.frame_squares(x),
+        "u_norm": metrics.frame_squares(x - X),
+        "tau_error": metrics.tensor_squares(tau_rom - tau),
+        "tau_norm": metrics.tensor_squares(tau),
+    }
+
+
+def _totals(column: dict[str, torch.Tensor], rollout: Rollout, particles: int) -> dict[str, float]:
+    """Errors over frames 1..N, as `Comparison` has them.
+
+    Raises:
+        InstabilityError: one is not finite, though the run did not diverge.
+    """
+
+    def total(error: str, norm: str) -> float:
         return metrics.relative(column[error][1:], column[norm][1:])
 
     errors = {
         "reconstruction_delta": total("rec_error", "x_norm"),
         "reconstruction_stress_error": total("rec_tau_error", "tau_norm"),
     }
-    reduced = {
-        "delta": ("x_error", "x_norm"),
-        "displacement_error": ("x_error", "u_norm"),
-        "stress_error": ("tau_error", "tau_norm"),
-    }
-    lost = set(reduced) if diverged else set()
-    if (
-        not column["tau_error"][1:].isfinite().all()
-    ):  # a law has no stress of a body that is turned inside out
-        lost.add("stress_error")
-    errors |= {name: total(*columns) for name, columns in reduced.items() if name not in lost}
-    if not diverged:
-        errors["distance"] = float((column["x_error"][1:].mean() / len(X)).sqrt())
-        errors["distance_max"] = float((column["x_error"].max() / len(X)).sqrt())
+    lost = [*_OF_RUNS, "distance", "distance_max"]
+    if rollout.diverged < 0:
+        errors |= {name: total(*columns) for name, columns in _OF_RUNS.items()}
+        errors["distance"] = float((column["x_error"][1:].mean() / particles).sqrt())
+        errors["distance_max"] = float((column["x_error"].max() / particles).sqrt())
+        lost = []
+        if not column["tau_error"][1:].isfinite().all():  # a body that is turned inside out has no stress
+            lost = ["stress_error"]
+            errors.pop("stress_error")
     metrics.require_finite(errors, rollout.case.named)
-    ends = [at_end(column[f"height_{of}"], shape[-1], X) for of, shape in (("rom", x_rom), ("fom", x))]
-    off = {name: np.inf if diverged else ends[0][name] - ends[1][name] for name in QUANTITIES}
-    if taken:
-        xhat[:] = torch.nan  # full-order frames are no latent vectors
-    return Comparison(
-        **dict.fromkeys((*reduced, "distance", "distance_max"), np.inf) | errors,
-        quantities=off,
-        series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
-        pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
-        | {"t": trajectory.t[shown_frames]}
-        | surroundings(scene, trajectory.t[shown_frames]),
-    )
+    return errors | dict.fromkeys(lost, np.inf)
 
 
 def _series(
@@ -251,10 +236,6 @@ def _series(
         errors = by_frame(error, norm).masked_fill(hardly, torch.nan)
         return errors.masked_fill(~column[error].isfinite(), torch.inf)
 
-    def momentum(name: str) -> torch.Tensor:
-        errors = metrics.momentum_error(column[f"{name}_rom"], column[f"{name}_fom"], column[f"{name}_scale"])
-        return errors.masked_fill(bad, torch.inf)
-
     return pd.DataFrame(
         {
             "case": rollout.case.named,
@@ -264,8 +245,6 @@ def _series(
             "delta": by_frame("x_error", "x_norm"),
             "displacement_error": moving("x_error", "u_norm"),
             "stress_error": moving("tau_error", "tau_norm"),
-            "linear_momentum_error": momentum("p"),
-            "angular_momentum_error": momentum("L"),
             "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
             "error_bound": bound_at_frames(rollout, t),
             **{f"xhat_{k + 1}": xhat[:, k] for k in range(xhat.shape[1])},
@@ -274,54 +253,52 @@ def _series(
     )
 
 
-class _Latents(NamedTuple):
-    """Latent vectors at frames.
+class _Pictures:
+    """Some particles in some frames, which are taken as the frames pass.
 
-    Attributes:
-        xhat: [F, r]; before: [F, r] x̂ a step before; rate: [F, r] dx̂/dt [1/s].
-        stress: [F, n_s] ŝ of a run that has them.
-        dt: step [s].
+    Args:
+        solver: of the reduced run; trajectory: the full-order one.
+        particles, frames: how many, at most.
     """
 
-    xhat: torch.Tensor
-    before: torch.Tensor
-    rate: torch.Tensor
-    stress: torch.Tensor | None
-    dt: float
+    def __init__(self, solver: ReducedMPM, trajectory: Trajectory, particles: int, frames: int):
+        self._setup, self._frames = solver.setup, spaced(trajectory.frames, frames)
+        self._samples = {n: _sample_at(solver, trajectory.t[n]) for n in self._frames}
+        self._shown = _shown(trajectory.particles, particles, np.concatenate(list(self._samples.values())))
+        self._t, self._kept = trajectory.t[self._frames], {}
 
-    def rows(self, frames: slice) -> "_Latents":
-        """Those of some frames."""
-        return _Latents(*(None if values is None else values[frames] for values in self[:4]), self.dt)
+    def take(self, block: slice, x, tau, x_rom, tau_rom) -> None:
+        """Keep what is shown of the frames of a block [F, P, 3] [m] and [F, P, 6] [Pa]."""
+        inside = [n - block.start for n in self._frames if block.start <= n < block.stop]
+        roles = [_roles(self._setup, x_rom[n], self._samples[block.start + n])[self._shown] for n in inside]
+        stress_full, stress_reduced = (metrics.von_mises(of[inside][:, self._shown]) for of in (tau, tau_rom))
+        kept = {
+            "x_full": x[inside][:, self._shown], "x_reduced": x_rom[inside][:, self._shown],
+            "stress_full": stress_full, "stress_reduced": stress_reduced,
+        }  # fmt: skip
+        arrays = {name: values.float().cpu().numpy() for name, values in kept.items()}
+        arrays["role"] = np.array(roles, np.int8).reshape(len(inside), len(self._shown))
+        for name, values in arrays.items():
+            self._kept.setdefault(name, []).append(values)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For `frames.npz`."""
+        return {name: np.concatenate(blocks) for name, blocks in self._kept.items()} | {"t": self._t}
 
 
-#: x [F, P, 3] [m], v [F, P, 3] [m/s], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames.
-_Fields = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
-
-
-def _read(trajectory: Trajectory, frames: slice, like: torch.Tensor) -> _Fields:
-    """Fields of some frames of a full-order run."""
-    read = (torch.as_tensor(trajectory.read(name, frames=frames)) for name in COMPONENTS)
-    x, v, C, tau = (values.to(like) for values in read)
-    return x, v, C.unflatten(2, (3, 3)), tau
-
-
-def _reduced_fields(decoder: Decoder, now: _Latents, carried: "_Carried | None") -> _Fields:
-    """Fields of some frames of a reduced run.
-
-    v is the backward difference of a step, as the particles of a full-order run have it.
+def _fields(
+    decoder: Decoder, xhat: torch.Tensor, stress: torch.Tensor | None, carried: "_Carried | None"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """x [F, P, 3] [m] and τ [F, P, 6] [Pa] of some frames of a reduced run.
 
     Args:
         decoder: the fields at every particle.
-        now: latents of the frames; those before them were decoded already.
-        carried: gives τ and C in place of the fields.
+        xhat: [F, r]; stress: [F, n_s] ŝ of a run that has them.
+        carried: gives τ in place of the fields; frames before these were asked for already.
     """
-    if carried is None:
-        C, tau = decoder.affine(now.xhat, now.rate), decoder.stress(now.xhat, now.stress)
-    else:
-        C, tau = carried.next(len(now.xhat))
-    x = decoder.position(now.xhat)
-    v = (x - decoder.position(now.before)) / now.dt
-    return x, v, C, tau[..., _UPPER[0], _UPPER[1]]
+    tau = decoder.stress(xhat, stress) if carried is None else carried.next(len(xhat))
+    return decoder.position(xhat), tau[..., _UPPER[0], _UPPER[1]]
 
 
 def _carries(solver: ReducedMPM, rollout: Rollout, trajectory: Trajectory) -> bool:
@@ -331,7 +308,7 @@ def _carries(solver: ReducedMPM, rollout: Rollout, trajectory: Trajectory) -> bo
 
 
 class _Carried:
-    """τ and C that particles carry along a run, frame by frame from t = 0 on.
+    """τ that particles carry along a run, frame by frame from t = 0 on.
 
     Args:
         solver: takes the run's steps once more.
@@ -342,16 +319,16 @@ class _Carried:
         solver.restart()
         self._solver, self._every, self._first = solver, every, True
 
-    def next(self, frames: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """C [F, P, 3, 3] [1/s] and τ [F, P, 3, 3] [Pa] of the next frames."""
+    def next(self, frames: int) -> torch.Tensor:
+        """τ [F, P, 3, 3] [Pa] of the next frames."""
         steps = []
         for _ in range(frames):
             if not self._first:
                 self._solver.step(self._every)
             self._first, span = False, self._solver.span
             order = torch.as_tensor(span.order, device=span.tau.device)
-            steps.append([torch.empty_like(a).index_copy_(0, order, a) for a in (span.C, span.tau)])
-        return tuple(torch.stack(values) for values in zip(*steps, strict=True))
+            steps.append(torch.empty_like(span.tau).index_copy_(0, order, span.tau))
+        return torch.stack(steps)
 
 
 def _roles(setup: Setup, x: torch.Tensor, sample: np.ndarray) -> np.ndarray:

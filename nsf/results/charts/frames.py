@@ -10,10 +10,7 @@ from nsf.results.style import error_scale, legend, panels
 from nsf.results.table import parameter
 
 _DASHED = (0, (2, 1.6))
-_OVER_TIME = (
-    *("delta", "displacement_error", "stress_error"),
-    *("linear_momentum_error", "angular_momentum_error"),
-)
+_OVER_TIME = ("delta", "displacement_error", "stress_error")
 
 
 @chart(
@@ -22,7 +19,7 @@ _OVER_TIME = (
     "distance moved, so it starts high."
 )
 def error_over_time(view: View) -> Figures:
-    """δ, displacement, stress and momentum errors [%] over time [s], a figure a body and model."""
+    """δ, displacement and stress errors [%] over time [s], a figure a body and model."""
     figures = {}
     for stem, series in best_series(view):
         shown = [name for name in _OVER_TIME if name in series and series[name].notna().any()]

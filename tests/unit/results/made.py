@@ -108,7 +108,6 @@ def _payload(path, made: Made) -> None:
     for case, delta in zip(made.cases, made.delta, strict=True):
         part = pd.DataFrame({"case": case, "split": "test", "frame": range(FRAMES), "t": t})
         errors = dict.fromkeys(("delta", "displacement_error", "stress_error"), delta * t)
-        errors |= dict.fromkeys(("linear_momentum_error", "angular_momentum_error"), delta * t)
         paths = {f"{of}_{k}": k * t for of in ("xhat", "encoded") for k in (1, 2)}
         parts.append(part.assign(**errors, reconstruction_delta=0.3 * delta, **paths))
     pd.concat(parts).to_csv(path / "series.csv", index=False)
