@@ -23,11 +23,16 @@ from nsf.scalars import one_of
 #: Modules of this package and scenes of `conf/scene`, in the order of the table.
 PROBLEMS = ("taylor_bar", "cantilever", "discs", "settling", "collapse", "incline")
 FILE = "validation.csv"
-_TEXTS = ("problem", "quantity", "unit", "published", "source", "limits", "device", "commit")
+_TEXTS = ("problem", "quantity", "unit", "published", "source", "limit", "limits", "device", "commit")
 _LEAD = "How far are full-order runs from published answers?"
 _OFF = (
-    "off: from the nearest published value, 0 within their spread; where 0 is published, the value itself. "
-    "s: CPU time of all runs of the problem."
+    "off: from the nearest published value, 0 within their spread; where 0 is published, the value "
+    "itself. cell, particles, steps: of the run that gave the value; steps go on from one load to the "
+    "next."
+)
+_SCENES = (
+    "Scenes stand in conf/scene. Values are as these sources are cited for them; their tables and figures "
+    "were not looked up."
 )
 _TICKS = (-50, -20, -10, -5, -2, -1, 0, 1, 2, 5, 10, 20, 50)
 _CHART = "How far off each quantity is; the band is 2 %."
@@ -68,32 +73,36 @@ def _rows(name: str, options: Mapping[str, str], say: Callable[[str], object]) -
     """The answers of one problem."""
     problem, device = import_module(f"nsf.validation.{name}"), options.get("device", "cpu")
     scene = load_scene(name, [f"scale={options.get('scale', 'small')}"])
+    paper = load_scene(name, ["scale=paper"])
+    finer = paper if paper.dx < scene.dx else None
     start, rows = process_time(), []
-    for answer in problem.answers(scene, device):
+    for answer in problem.answers(scene, finer, device):
         span = dict.fromkeys(map(number, sorted(answer.published)[:: max(1, len(answer.published) - 1)]))
         rows.append({
             "problem": name, "quantity": answer.quantity, "unit": answer.unit,
             "published": " to ".join(span) or ABSENT, "source": answer.source, "computed": answer.computed,
             "off": answer.difference if answer.published else np.nan,
-            "cell": scene.dx, "particles": scene.particle_count, "steps": scene.steps, "seconds": None,
-            "limits": problem.LIMITS, "device": device, "commit": commit_text(provenance()),
+            "cell": answer.cell, "particles": answer.particles, "steps": answer.steps, "seconds": None,
+            "limit": answer.limit, "limits": problem.LIMITS,
+            "device": device, "commit": commit_text(provenance()),
         })  # fmt: skip
         say(f"{name}: {answer.quantity} {number(answer.computed)}, published {rows[-1]['published']}")
     return [row | {"seconds": process_time() - start} for row in rows]
 
 
 def table(frame: pd.DataFrame) -> Rows:
-    """The table of the page and of `nsf reports`; facts of a problem stand in its first row."""
+    """The table of the page and of `nsf reports`; the title of a problem stands in its first row."""
     first, titles = ~frame["problem"].duplicated(), frame["problem"].map(_title)
     units = frame["unit"].map(lambda unit: f" [{unit}]" if unit != "-" else "")
     columns = {"problem": titles.where(first, ""), "quantity": frame["quantity"] + units}
     columns |= {"published": frame["published"]}
     columns |= {"ours": frame["computed"].map(number), "off [%]": frame["off"].map(number)}
-    for heading, key in (("cell [m]", "cell"), ("s", "seconds"), ("particles", "particles")):
-        columns[heading] = frame[key].map(number).where(first, "")
-    columns["source"] = frame["source"]
+    for heading, key in (("cell [m]", "cell"), ("particles", "particles"), ("steps", "steps")):
+        columns[heading] = frame[key].map(number)
+    columns["what limits it"] = frame["limit"].fillna("")
     body = [list(row) for row in zip(*columns.values(), strict=True)]
-    return Rows(list(columns), body, [name not in ("problem", "quantity", "source") for name in columns])
+    texts = ("problem", "quantity", "what limits it")
+    return Rows(list(columns), body, [heading not in texts for heading in columns])
 
 
 def _title(name: str) -> str:
@@ -132,7 +141,7 @@ def _write(folder: Path, frame: pd.DataFrame) -> Path:
         f"{device}, {commit}" for device, commit in zip(made["device"], made["commit"], strict=True)
     )
     stated = frame[["problem", "limits"]].drop_duplicates()
-    limits = [(_title(name), text) for name, text in stated.itertuples(index=False)]
+    limits = [(_title(name), f"limited by {text}") for name, text in stated.itertuples(index=False)]
     with replaced(folder) as fresh:
         frame.to_csv(fresh / FILE, index=False)
         save(chart(frame), fresh, "off", kinds=("png",))
@@ -140,7 +149,7 @@ def _write(folder: Path, frame: pd.DataFrame) -> Path:
             title="Published answers", lead=_LEAD, facts=[("Made", made)], warnings=[],
             tables=[Table("Answers", rows, _OFF)], definitions=limits,
             sections=[Section("Chart", [Picture(["off.png"], _CHART, [])])],
-            provenance=Table("Scenes", _scenes(frame), "Scenes stand in conf/scene."),
+            provenance=Table("Scenes and sources", _scenes(frame), _SCENES),
         )  # fmt: skip
         page.write(fresh)
         listed = vars(rows) | {"said": _OFF, "made": made}
@@ -150,7 +159,9 @@ def _write(folder: Path, frame: pd.DataFrame) -> Path:
 
 
 def _scenes(frame: pd.DataFrame) -> Rows:
-    """A row a problem: its scene, cells and steps."""
-    one = frame.drop_duplicates("problem")[["problem", "cell", "particles", "steps", "device", "commit"]]
-    body = [[number(value) for value in row] for row in one.itertuples(index=False, name=None)]
-    return Rows(["scene", "cell [m]", *one.columns[2:]], body, [False, True, True, True, False, False])
+    """A row a problem: its scene, where its values are published, and the CPU time of all its runs."""
+    one = frame.drop_duplicates("problem")
+    columns = {"scene": one["problem"], "published": one["source"], "CPU [s]": one["seconds"].map(number)}
+    columns |= {"device": one["device"], "commit": one["commit"]}
+    body = [list(row) for row in zip(*columns.values(), strict=True)]
+    return Rows(list(columns), body, [heading == "CPU [s]" for heading in columns])

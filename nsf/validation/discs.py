@@ -10,15 +10,16 @@ from nsf.validation.problem import Answer, kinetic_energy
 
 TITLE = "Collision of two elastic discs"
 LIMITS = "APIC, which loses energy in the collision."
-_SOURCE = "Sulsky"
+_SOURCE = "Sulsky et al. 1994, Comput. Methods Appl. Mech. Eng. 118, 179–196: by conservation"
 _LOOKS = 70  # at the energy, in a run
 
 
-def answers(scene: Scene, device: str) -> Iterator[Answer]:
+def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
     """Energy before, largest momentum and rise of energy, and whether the discs part."""
     solver = scene.full_order(device=device)
     thickness = scene.bodies["lower"].shape.height
-    yield Answer("kinetic energy before", "J/m", (2.513,), _SOURCE, kinetic_energy(solver) / thickness)
+    before = kinetic_energy(solver) / thickness
+    yield Answer.of(solver, "kinetic energy before", "J/m", (2.513,), _SOURCE, before)
     mass, lower = solver.constants.mass, scene.bodies["lower"].particles
     first = mass[:lower] @ solver.state.v.numpy()[:lower]
     energies, momenta = [], []
@@ -31,9 +32,11 @@ def answers(scene: Scene, device: str) -> Iterator[Answer]:
         momenta.append(np.linalg.norm((mass @ solver.state.v.numpy())[:2]))
     last = mass[:lower] @ solver.state.v.numpy()[:lower]
     rise = max(energies - np.minimum.accumulate(energies))
-    yield Answer("momentum over a disc's", "%", (0.0,), _SOURCE, 100.0 * max(momenta) / np.linalg.norm(first))
-    yield Answer("rise of total energy", "%", (0.0,), _SOURCE, 100.0 * rise / energies[0])
-    yield Answer("speed after over before", "-", (), _SOURCE, float(-(last @ first) / (first @ first)))
+    momentum = 100.0 * max(momenta) / np.linalg.norm(first)
+    yield Answer.of(solver, "momentum over a disc's", "%", (0.0,), _SOURCE, momentum)
+    yield Answer.of(solver, "rise of total energy", "%", (0.0,), _SOURCE, 100.0 * rise / energies[0])
+    restitution = float(-(last @ first) / (first @ first))
+    yield Answer.of(solver, "speed after over before", "-", (), _SOURCE, restitution)
 
 
 def elastic_energy(solver: FullOrderMPM) -> float:

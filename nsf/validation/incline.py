@@ -10,7 +10,7 @@ TITLE = "Block on an incline, Coulomb"
 LIMITS = "the start: the block slides as a whole once a shear wave has crossed it."
 
 
-def answers(scene: Scene, device: str) -> Iterator[Answer]:
+def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
     """The way of the mass centre against ½ g t² (sin θ − μ cos θ)."""
     theta, friction = math.radians(scene.inclination.angle), scene.colliders["plane"].friction
     solver = scene.full_order(device=device)
@@ -19,4 +19,5 @@ def answers(scene: Scene, device: str) -> Iterator[Answer]:
     way = -0.5 * scene.gravity[2] * scene.duration**2 * (math.sin(theta) - friction * math.cos(theta))
     down = math.copysign(1.0, scene.base_gravity[0])
     name = f"way in {scene.duration:.3g} s"
-    yield Answer(name, "m", (round(way, 6),), "½ g t² (sin θ − μ cos θ)", down * float(moved[0]))
+    source = "closed form: ½ g t² (sin θ − μ cos θ)"
+    yield Answer.of(solver, name, "m", (round(way, 6),), source, down * float(moved[0]))

@@ -21,8 +21,9 @@ class Answer:
     Attributes:
         quantity: its name; unit: its unit.
         published: the value, or the values whose spread counts as agreement.
-        source: of the published values.
-        computed: by a full-order run.
+        source: of the published values: author, year, and where.
+        computed: by a full-order run, of `cell` [m], `particles` and `steps`.
+        limit: what keeps the answer off, as measured.
     """
 
     quantity: str
@@ -30,6 +31,15 @@ class Answer:
     published: tuple[float, ...]
     source: str
     computed: float
+    cell: float = math.nan
+    particles: int = 0
+    steps: int = 0
+    limit: str = ""
+
+    @classmethod
+    def of(cls, solver: FullOrderMPM, *values, limit: str = "") -> "Answer":
+        """An answer whose cell, particles and steps are those of a solver at the end of its run."""
+        return cls(*values, solver.grid.geometry.dx, len(solver.constants), solver.steps_taken, limit)
 
     @property
     def difference(self) -> float:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from nsf.mpm import FullOrderMPM
 from nsf.scenes import Scene
 from nsf.validation.problem import Answer, relax, spread
 
@@ -12,27 +13,28 @@ LIMITS = (
     "the lowest cell, whose strain the floor holds; and quadrature, as compression moves particles off "
     "the lattice. Particles spread as in other scenes are noisy from the start: the last row."
 )
-_SOURCE = "equilibrium"
+_SOURCE = "closed form: equilibrium, σ = ρ₀ g (l₀ − y₀)"
 
 
-def answers(scene: Scene, device: str) -> Iterator[Answer]:
+def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
     """Vertical Cauchy stress against ρ₀ g (l₀ − y₀): the slope, and the distance of particles from it."""
-    stress, exact = stresses(scene, device)
+    solver, stress, exact = stresses(scene, device)
     slope = float(np.polyfit(exact, stress, 1)[0])
-    yield Answer("stress over ρ₀ g (l₀ − y₀), slope", "-", (1.0,), _SOURCE, slope)
-    yield Answer("single particles' distance from it", "%", (0.0,), _SOURCE, distance(stress, exact))
-    quantity = "the same, particles spread"
-    yield Answer(quantity, "%", (0.0,), _SOURCE, distance(*stresses(spread(scene, "column"), device)))
+    yield Answer.of(solver, "stress over ρ₀ g (l₀ − y₀), slope", "-", (1.0,), _SOURCE, slope)
+    quantity = "single particles' distance from it"
+    yield Answer.of(solver, quantity, "%", (0.0,), _SOURCE, distance(stress, exact))
+    solver, stress, exact = stresses(spread(scene, "column"), device)
+    yield Answer.of(solver, "the same, particles spread", "%", (0.0,), _SOURCE, distance(stress, exact))
 
 
-def stresses(scene: Scene, device: str) -> tuple[np.ndarray, np.ndarray]:
-    """[P] vertical pressure at rest and ρ₀ g (l₀ − y₀) [Pa]."""
+def stresses(scene: Scene, device: str) -> tuple[FullOrderMPM, np.ndarray, np.ndarray]:
+    """The solver at rest, and [P] vertical pressure and ρ₀ g (l₀ − y₀) [Pa]."""
     column = scene.bodies["column"]
     solver = scene.full_order(device=device)
     relax(solver)
     state, z = solver.state.numpy(), solver.constants.X[:, 2]
     pressure = -state["tau"][:, 2, 2] / np.linalg.det(state["F_e"])
-    return pressure, -column.density * scene.gravity[2] * (column.shape.upper[2] - z)
+    return solver, pressure, -column.density * scene.gravity[2] * (column.shape.upper[2] - z)
 
 
 def distance(stress: np.ndarray, exact: np.ndarray) -> float:

@@ -9,13 +9,24 @@ from nsf.validation.problem import Answer, position
 
 TITLE = "Taylor bar, copper, 227 m/s"
 LIMITS = (
-    "cells and time step: APIC loses energy at each step, so that shorter steps make the foot smaller; finer "
-    "cells make it larger."
+    "cells and time step: APIC loses energy at each step, so that shorter steps make the foot smaller; "
+    "finer cells make it larger."
+)
+_SOURCE = (
+    "Foulk et al. 2021, Int. J. Numer. Methods Eng. 122 (7.22); Simo 1992, Comput. Methods Appl. Mech. "
+    "Eng. 99, 61–112 (7.12); Zienkiewicz et al. 1998, Int. J. Numer. Methods Eng. 43, 565–583 (7.11)"
 )
 
 
-def answers(scene: Scene, device: str) -> Iterator[Answer]:
-    """The radius at the foot, along both planes of symmetry and the diagonal between."""
+def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
+    """The radius at the foot: the mean along both planes of symmetry and three directions between."""
+    for one, addition in ((scene, ""), (finer, ", half the cell")):
+        if one:
+            yield _radius(one, device, addition)
+
+
+def _radius(scene: Scene, device: str, addition: str) -> Answer:
+    """The radius at the foot of one scene."""
     bar = scene.bodies["bar"].shape
     solver = scene.full_order(device=device)
     solver.step(scene.steps)
@@ -23,7 +34,5 @@ def answers(scene: Scene, device: str) -> Iterator[Answer]:
     for angle in np.radians([0.0, 22.5, 45.0, 67.5, 90.0]):
         rim = position(solver, bar.base + bar.radius * np.array([np.cos(angle), np.sin(angle), 0.0]))
         radii.append(np.hypot(*(rim - bar.base)[:2]))
-    yield Answer(
-        "final radius of the foot", "mm", (7.22, 7.12, 7.11), "Foulk 2021, Simo 1992, Zienkiewicz 1998",
-        1e3 * float(np.mean(radii)),
-    )  # fmt: skip
+    quantity = f"final radius of the foot{addition}"
+    return Answer.of(solver, quantity, "mm", (7.22, 7.12, 7.11), _SOURCE, 1e3 * float(np.mean(radii)))

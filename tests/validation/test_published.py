@@ -3,12 +3,15 @@
 import itertools
 from importlib import import_module
 
+import numpy as np
 import pandas as pd
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import nsf
 from nsf.results.folder import read
-from nsf.validation import validate
+from nsf.validation import cantilever, validate
 from nsf.validation.problem import Answer
 
 SLOW = {"marks": pytest.mark.slow}
@@ -24,7 +27,10 @@ CASES = [
     pytest.param("settling", {"stress over ρ₀ g (l₀ − y₀), slope": 2.0}, id="settling", **SLOW),
     pytest.param("taylor_bar", {"final radius of the foot": 2.0}, id="taylor_bar", **SLOW),
     pytest.param(
-        "cantilever", {"w/L at P L²/EI = 1": 1.0, "u/L at P L²/EI = 1": 1.0}, id="cantilever", **SLOW
+        "cantilever",
+        {f"{name}/L at P L²/EI = {ratio}": 2.0 for ratio in cantilever.ELASTICA for name in "wu"},
+        id="cantilever",
+        **SLOW,
     ),
 ]
 
@@ -32,9 +38,24 @@ CASES = [
 @pytest.mark.parametrize(("name", "bounds"), CASES)
 def test_answer_is_the_published_one(name, bounds):
     """The first answers of each problem, as far as its bounds name them."""
-    answers = import_module(f"nsf.validation.{name}").answers(nsf.load_scene(name), "cpu")
+    answers = import_module(f"nsf.validation.{name}").answers(nsf.load_scene(name), None, "cpu")
     for answer in itertools.islice(answers, len(bounds)):
         assert abs(answer.difference) < bounds[answer.quantity], answer
+
+
+@pytest.mark.parametrize(("ratio", "published"), cantilever.ELASTICA.items())
+def test_published_deflections_solve_the_elastica(ratio, published):
+    """θ'' = −(P L²/EI) cos θ, θ(0) = θ'(1) = 0, w' = sin θ, x' = cos θ; θ'(0) by shooting."""
+
+    def slope(s, y):
+        return [y[1], -ratio * np.cos(y[0]), np.sin(y[0]), np.cos(y[0])]
+
+    def end(curvature):
+        return solve_ivp(slope, (0.0, 1.0), [0.0, curvature, 0.0, 0.0], rtol=1e-9, atol=1e-10).y[:, -1]
+
+    curvature = brentq(lambda curvature: end(curvature)[1], 0.0, np.sqrt(2.0 * ratio))
+    _, _, w, x = end(curvature)
+    assert (w, 1.0 - x) == pytest.approx(published, abs=6e-6)
 
 
 def test_a_value_within_the_published_spread_is_not_off():
@@ -51,7 +72,7 @@ def test_a_report_is_listed_and_keeps_the_rows_of_other_problems(tmp_path, monke
     for name in ("incline", "settling", "incline"):
         problem = import_module(f"nsf.validation.{name}")
         answer = Answer("way", "m", (0.5,), "closed form", 0.51)
-        monkeypatch.setattr(problem, "answers", lambda scene, device, answer=answer: iter([answer]))
+        monkeypatch.setattr(problem, "answers", lambda scene, finer, device, answer=answer: iter([answer]))
         validate(tmp_path / "validation", {"problems": name}, said.append)
     rows = pd.read_csv(tmp_path / "validation/validation.csv")
     assert list(rows["problem"]) == ["settling", "incline"]
