@@ -19,6 +19,7 @@ from nsf.errors import StorageError
 
 _SPACE = "free some space, or write to another disk (NSF_RUNS, NSF_REPORTS)"
 _ACCESS = "make the folder writable, or write elsewhere (NSF_RUNS, NSF_REPORTS)"
+_GONE = "its folder was deleted or moved meanwhile"
 _PLACE = "a file stands where a folder is needed; write elsewhere (NSF_RUNS, NSF_REPORTS)"
 #: What to do where a folder has gone as it was written.
 AGAIN = "run the same command again, and leave the folder until it is done"
@@ -74,7 +75,7 @@ def writing(path: str | Path, sealed: bool = False) -> Iterator[Path]:
         os.replace(partial, path)
     except (OSError, RuntimeError) as error:
         if not folder.is_dir():
-            raise _storage_error(path, "its folder was deleted or moved meanwhile", AGAIN) from error
+            raise _storage_error(path, _GONE, AGAIN) from error
         fault = _fault(error, folder)
         if fault is None:
             raise
@@ -154,13 +155,15 @@ def locked(path: str | Path, waiting: Callable[[], object] | None = None) -> Ite
         Whether the lock is held; False only where another process has it and nothing is waited for.
 
     Raises:
-        StorageError: the file cannot be made.
+        StorageError: the file cannot be made, or its folder was deleted meanwhile.
     """
     path = Path(path)
     lock = _lock(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         held = _acquired(lock, waiting)
+    except FileNotFoundError as error:
+        raise _storage_error(path, _GONE, AGAIN) from error
     except OSError as error:
         raise _storage_error(
             path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS)

@@ -5,11 +5,12 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from nsf.errors import StorageError
-from nsf.storage import refusals, require_folder, require_space, write_json, writing
+from nsf.storage import locked, refusals, require_folder, require_space, write_json, writing
 
 
 @pytest.fixture
@@ -47,6 +48,13 @@ def test_a_folder_that_goes_as_it_is_written(tmp_path):
         partial.write_text("half")
         shutil.rmtree(target.parent)
     assert not target.parent.exists()
+
+
+def test_a_folder_that_goes_as_it_is_locked(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "mkdir", lambda *arguments, **options: None)
+    gone = pytest.raises(StorageError, match=r"\.lock: its folder was deleted .*run the same command again")
+    with gone, locked(tmp_path / "new" / ".lock"):
+        pass
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space"), OSError(errno.EIO, "broken")])
