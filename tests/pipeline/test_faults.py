@@ -62,17 +62,6 @@ def refused(nsf, tmp_path, tiny, monkeypatch, capsys):
     signal.signal(signal.SIGTERM, handler)
 
 
-def test_a_bad_trajectory(refused, copied, pipeline_at, replace):
-    """Tests of trajectories, checkpoints and rollouts have the other ways to be bad."""
-    root = copied("simulate")
-    run = pipeline_at(root).simulation(angle(30.0))
-    replace(run, "trajectory.h5", truncate)
-    line = refused("train", root)
-    assert f"{run.path / 'trajectory.h5'} is truncated" in line
-    assert "simulate again" in line
-    assert not [r for r in Run.find("train", root=root) if r.complete]
-
-
 def test_a_trajectory_cut_short_is_simulated_again(copied, pipeline_at, refused):
     root = copied("simulate")
     run = pipeline_at(root).simulation(angle(30.0))
@@ -87,16 +76,6 @@ def test_a_trajectory_cut_short_is_simulated_again(copied, pipeline_at, refused)
     pipeline.run("train")
 
 
-def test_a_bad_checkpoint(refused, copied, pipeline_at, replace):
-    root = copied("simulate", "train")
-    run = pipeline_at(root).training
-    replace(run, "manifold.pt", truncate)
-    line = refused("deploy", root)
-    assert str(run.path / "manifold.pt") in line
-    assert "nsf train" in line
-    assert not Run.find("deploy", root=root)
-
-
 def test_a_checkpoint_cut_short_is_trained_again(copied, pipeline_at, chain):
     root = copied("simulate", "train")
     pipeline = pipeline_at(root)
@@ -106,15 +85,6 @@ def test_a_checkpoint_cut_short_is_trained_again(copied, pipeline_at, chain):
         torch.load(p, weights_only=True) for p in (pipeline.training.path / "manifold.pt", chain.checkpoint)
     )
     assert all(torch.equal(one["state"][k], other["state"][k]) for k in one["state"])
-
-
-def test_a_bad_rollout(refused, copied, pipeline_at, replace):
-    root = copied("simulate", "train", "deploy")
-    run = pipeline_at(root).deployment
-    replace(run, "rollout_0.h5", truncate)
-    line = refused("evaluate", root)
-    assert str(run.path / "rollout_0.h5") in line
-    assert "deploy" in line
 
 
 def test_a_spoiled_manifest_is_an_incomplete_run(copied, pipeline_at):
@@ -153,16 +123,6 @@ def another_file(path):
         file["frames/x"] = h5py.ExternalLink("/etc/passwd", "/")
 
 
-def pipe(path):
-    path.unlink()
-    os.mkfifo(path)
-
-
-def linked(path):
-    path.rename(path.parent.parent / "elsewhere")
-    path.symlink_to(path.parent.parent / "elsewhere")
-
-
 #: The stage that reads a file, whose it is, and what it is called.
 READ = [
     ("train", lambda p: p.simulation(angle(30.0)), "trajectory.h5"),
@@ -173,21 +133,13 @@ READ = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("of", "change"),
-    [*((of, bit) for of in READ), (READ[1], pipe), (READ[3], linked)],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_a_file_that_was_changed_after_its_run(refused, copied, pipeline_at, of, change):
-    stage, run_of, name = of
+@pytest.mark.parametrize(("stage", "run_of", "name"), READ)
+def test_a_file_that_was_changed_after_its_run(refused, copied, pipeline_at, stage, run_of, name):
     root = copied(*STAGES[: STAGES.index(stage)])
     run = run_of(pipeline_at(root))
-    change(run.path / name)
+    bit(run.path / name)
     line = refused(stage, root)
-    if change is bit:
-        assert f"{run.path / name} has sha256" in line
-    else:
-        assert f"{run.path} is not whole ({name} missing or cut short)" in line
+    assert f"{run.path / name} has sha256" in line
     assert f"run `nsf {run.stage}" in line
     assert not [r for r in Run.find(stage, root=root) if r.complete]
 
@@ -195,21 +147,25 @@ def test_a_file_that_was_changed_after_its_run(refused, copied, pipeline_at, of,
 @pytest.mark.parametrize(
     ("of", "change", "told"),
     [
+        (READ[0], truncate, "is truncated"),
+        (READ[1], truncate, "is truncated or no"),
+        (READ[2], truncate, "is truncated or"),
         (READ[0], nan_in("frames/tau", (3, 7, 2)), "non-finite values of tau, as in frame 3"),
         (READ[0], another_file, "has a link in the place of frames/x"),
         (READ[1], nan_weights, "non-finite values of fields.stress.network.layers.0.weight"),
         (READ[2], nan_in("xhat", (7, 1)), "non-finite values of xhat"),
     ],
 )
-def test_values_that_no_run_leaves(refused, copied, pipeline_at, of, change, told, replace):
+def test_what_no_run_leaves(refused, copied, pipeline_at, of, change, told, replace):
     """As if the run itself had left them."""
     stage, run_of, name = of
     root = copied(*STAGES[: STAGES.index(stage)])
     run = run_of(pipeline_at(root))
     replace(run, name, change)
     line = refused(stage, root)
-    assert f"{run.path / name} has" in line
+    assert f"{run.path / name} " in line
     assert told in line
+    assert run.stage in line
     assert not [r for r in Run.find(stage, root=root) if r.complete]
 
 

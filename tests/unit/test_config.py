@@ -155,12 +155,6 @@ def test_a_key_that_cannot_be_left_out_or_added(override, remedy):
         config.load(["scene=sand", override])
 
 
-def test_a_misspelt_class_is_told_the_nearest():
-    target = "nsf.mpm.materials.DruckrPrager"
-    with pytest.raises(ConfigError, match=re.escape("did you mean nsf.mpm.materials.DruckerPrager?")):
-        config.build({"_target_": target}, "material")
-
-
 def test_a_node_cannot_be_replaced_by_other_keys():
     with pytest.raises(ConfigError, match=r"scene.bodies.column.shape' takes no keys beyond its own"):
         config.load(["scene.bodies.column.shape={_target_:nsf.scenes.Ball,centre:[0.5,0.5,0.5]}"])
@@ -250,15 +244,9 @@ def test_what_follows_an_entry_of_a_list_is_found_however_it_is_named():
     assert sorted(following(config, "a.1")) == sorted(following(config, "a[1]")) == [("b",), ("c",)]
 
 
-@pytest.mark.parametrize(
-    "override",
-    [
-        "trainer.devices=2",
-    ],
-)
-def test_a_removed_key_names_its_replacement(override):
+def test_a_removed_key_names_its_replacement():
     with pytest.raises(ConfigError, match=r"trainer\.devices was removed; .*hydra/launcher=joblib"):
-        config.load([override])
+        config.load(["trainer.devices=2"])
 
 
 def test_a_file_with_a_removed_key_is_refused(tmp_path):

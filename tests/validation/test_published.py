@@ -1,6 +1,7 @@
 """Problems with published answers (physics.md, section 4), as `nsf validate` runs them."""
 
 import itertools
+import math
 from importlib import import_module
 
 import numpy as np
@@ -11,7 +12,8 @@ from scipy.optimize import brentq
 
 import nsf
 from nsf.results.folder import read
-from nsf.validation import cantilever, validate
+from nsf.validation import cantilever, incline, validate
+from nsf.validation.collapse import run_out
 from nsf.validation.problem import Answer
 
 SLOW = {"marks": pytest.mark.slow}
@@ -56,6 +58,25 @@ def test_published_deflections_solve_the_elastica(ratio, published):
     curvature = brentq(lambda curvature: end(curvature)[1], 0.0, np.sqrt(2.0 * ratio))
     _, _, w, x = end(curvature)
     assert (w, 1.0 - x) == pytest.approx(published, abs=6e-6)
+
+
+def test_a_block_rests_where_friction_exceeds_the_slope():
+    (way,) = incline.answers(nsf.load_scene("incline", ["scene.colliders.plane.friction=0.58"]), "cpu")
+    assert abs(way.computed) < 1e-3
+
+
+def test_taller_columns_run_out_farther():
+    """And by less than in proportion to their height."""
+    coarse = nsf.load_scene("collapse", ["scene.dx=0.025", "scene.dt=9e-4", "scene.steps=1000"])
+    low, high = (run_out(coarse, a, "cpu") for a in (1.0, 2.0))
+    assert low < high < 2.0 * low
+
+
+@pytest.mark.slow
+def test_run_out_grows_with_the_root_of_the_aspect_ratio():
+    """Of tall columns, with an exponent of 1/2 within 0.1 (Lube et al. 2004)."""
+    low, tall = (run_out(nsf.load_scene("collapse"), a, "cpu") for a in (6.0, 10.0))
+    assert math.log(tall / low) / math.log(10.0 / 6.0) == pytest.approx(0.5, abs=0.1)
 
 
 def test_a_value_within_the_published_spread_is_not_off():

@@ -1,11 +1,11 @@
-"""Structures with a closed form: a vibrating bar, a block on an incline (physics.md, section 3)."""
+"""Structures with a closed form: a vibrating bar (physics.md, section 3)."""
 
 import math
 
 import numpy as np
 import pytest
 
-from nsf.mpm import DomainWalls, HalfSpace, Transfer
+from nsf.mpm import HalfSpace, Transfer
 from nsf.mpm.materials import FixedCorotated, Hencky
 
 FAR = 1e3
@@ -53,60 +53,3 @@ def test_vibrating_bar(law, shape, solver_of):
     zeros = t[k] - amplitude[k] * 0.02 / (amplitude[k + 1] - amplitude[k])
     observed = math.pi * (len(k) - 1) / (zeros[-1] - zeros[0])
     assert observed == pytest.approx(omega, rel=0.01)
-
-
-THETA, PHI, G, T = math.radians(24.0), math.radians(15.0), 10.0, 0.3
-
-
-@pytest.fixture
-def slide(lattice, solver_of):
-    """(frame, φ) → displacement [m] along and normal to the incline of a block after T, domain 1 m.
-
-    A stiff block, so that the start (a shear wave crossing it before all of it slides) takes little time.
-    """
-
-    def run(frame, phi):
-        floor = np.array([0.25, 0.375, 0.5])
-        local = lattice([0.0] * 3, [0.25, 0.25, 0.125], 1.0 / 32.0)
-        if frame == "tilted gravity":
-            along, normal = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-            gravity = G * (math.sin(THETA) * along - math.cos(THETA) * normal)
-        else:
-            along, normal = (
-                np.array([math.cos(THETA), 0.0, -math.sin(THETA)]),
-                np.array([math.sin(THETA), 0.0, math.cos(THETA)]),
-            )
-            gravity = np.array([0.0, 0.0, -G])
-        # A hair above the nodes, so that those on the plane belong to the incline.
-        X = floor + local @ np.stack([along, [0.0, 1.0, 0.0], normal]) + 1e-9 * normal
-        incline = HalfSpace(floor + 1e-9 * normal, normal, "separate", math.tan(phi))
-        material = FixedCorotated(3e4, 0.3)
-        solver = solver_of(
-            X,
-            1.0 / 32.0,
-            1.0 / 16.0,
-            T / 2400,
-            material=material,
-            gravity=gravity,
-            colliders=[incline],
-            walls=DomainWalls(),
-        )
-        solver.step(2400)
-        moved = (solver.state.x.numpy() - X).mean(0)
-        return moved @ along, moved @ normal
-
-    return run
-
-
-def test_block_slides_down_an_incline(slide):
-    """½ g t² (sin θ − tan φ cos θ) at θ 24°, φ 15°, within 1e-3 of the domain."""
-    along, normal = slide("tilted plane", PHI)
-    expected = 0.5 * G * T**2 * (math.sin(THETA) - math.tan(PHI) * math.cos(THETA))
-    assert expected == pytest.approx(0.0728788, abs=1e-6)
-    assert along == pytest.approx(expected, abs=1e-3)
-    assert abs(normal) < 1e-3
-
-
-def test_block_rests_where_friction_exceeds_the_slope(slide):
-    along, _ = slide("tilted gravity", math.radians(30.0))
-    assert abs(along) < 1e-3
