@@ -89,9 +89,10 @@ class Tilt(Program):
         taught = model.recurrence.taught
         most = np.degrees(largest_tilt(self._gravity, np.array(taught.gravity), taught.reach))
         if not 0.0 < angle <= most + 1e-9:
+            wider = "wider programs" if model.scene.forcing.gravity else "programs"
             raise ConfigError(
-                f"tilt={angle:g}° must lie above 0° and within the {most:.3g}° that was taught; or "
-                "train with programs of scene.forcing.gravity"
+                f"tilt={angle:g}° must lie above 0° and within the {most:.3g}° that was "
+                f"taught; or train with {wider} of scene.forcing.gravity"
             )
         # A square within the disc.
         super().__init__(

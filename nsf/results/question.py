@@ -36,6 +36,7 @@ class Question:
         title, text: of the page, and the question.
         paper: what the paper says of it.
         keys: by run id, the keys and values of its job.
+        defaults: by run id, numbers of keys that its job leaves out and another job of its scene sets.
         printed: δ that the paper prints of single jobs: each {"delta": fraction} and, as text, keys of the
             job or columns that it is of. None: what the scenes' files say of them holds.
         missing: jobs without a result, with the reason.
@@ -52,10 +53,11 @@ class Question:
     missing: Sequence[str] = ()
     fine: Mapping[str, Run] = field(default_factory=dict)
     plots: Sequence[str] | None = None
+    defaults: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def settings(self) -> dict[str, dict[str, str]]:
-        """By run id, the keys that its jobs vary, but for those that columns of the table have."""
+        """By run id, values of the keys that jobs vary, but for those that columns of the table have."""
         jobs = list(self.keys.values())
         keys = dict.fromkeys(key for job in jobs for key in job)
         varied = [
@@ -65,7 +67,8 @@ class Question:
             and not key.startswith(_PASSING)
             and len({job.get(key) for job in jobs}) > 1
         ]
-        return {run: {key: job[key] for key in varied if key in job} for run, job in self.keys.items()}
+        whole = {run: {**self.defaults.get(run, {}), **job} for run, job in self.keys.items()}
+        return {run: {key: values[key] for key in varied if key in values} for run, values in whole.items()}
 
 
 def unchanged(folder: Path, runs: Iterable[Run], question: Question, first: Run | None = None) -> Path | None:

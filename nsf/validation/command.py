@@ -15,7 +15,7 @@ from nsf.results.folder import check_place, record, replaced
 from nsf.results.formats import Rows, TerminalTable
 from nsf.results.page import Page, Picture, Section, Table
 from nsf.results.report import commit_text
-from nsf.results.style import INK, PALETTE, figure, save, styled
+from nsf.results.style import INK, PALETTE, figure, legend, save, styled
 from nsf.results.table import parsed
 from nsf.runs.provenance import provenance
 from nsf.scalars import one_of
@@ -116,15 +116,16 @@ def chart(frame: pd.DataFrame) -> Figure:
     with styled():
         fig = figure(0.8 + 0.24 * len(frame))
         panel, at = fig.subplots(), np.arange(len(frame))
-        panel.axvspan(-2.0, 2.0, color=PALETTE[0], alpha=0.15, lw=0)
+        panel.axvspan(-2.0, 2.0, color=PALETTE[0], alpha=0.15, lw=0, label="within 2 %")
         panel.axvline(0.0, color=INK, lw=0.8)
-        panel.plot(frame["off"], at, "o", color=PALETTE[0])
+        panel.plot(frame["off"], at, "o", color=PALETTE[0], label="full-order run less published answer")
         panel.set_xscale("symlog", linthresh=2.0)
         panel.set_xlim(*(sign * max(60.0, 1.2 * frame["off"].abs().max()) for sign in (-1.0, 1.0)))
         panel.set_xticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
         panel.set(yticks=at, yticklabels=frame["problem"].str.replace("_", " ") + ": " + frame["quantity"])
         panel.set(xlabel="off [%]", ylim=(len(frame) - 0.5, -0.5))
         panel.grid(axis="x")
+        legend(fig)
     return fig
 
 

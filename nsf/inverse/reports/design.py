@@ -87,18 +87,23 @@ def _shown(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _warnings(program: Program, designed: Designed, missed: float) -> list[str]:
-    """Sentences on a program whose run misses its targets by so many tolerances (RMS)."""
+    """Sentences on a program whose run misses its targets by so many tolerances (RMS), with one remedy."""
+    doubted = designed.error_bound > (limit := program.model.trust.limit)
+    untaught = isinstance(program, Tilt) and not program.model.scene.forcing.gravity
+    if untaught:
+        remedy = "train with programs of scene.forcing.gravity: the fields know no shape that a tilt makes"
+    elif doubted:
+        remedy = "choose targets nearer by, or train with more programs"
+    else:
+        remedy = "allow wider bounds or more knots, or choose targets nearer by"
     warnings = []
     if missed > _MISSED:
         warnings.append(
             f"no program was found that reaches the targets; the best misses them by {missed:.3g} "
-            "tolerances; allow wider bounds or more knots, or choose targets nearer by"
+            f"tolerances; {remedy}"
         )
-    if designed.error_bound > (limit := program.model.trust.limit):
+    elif untaught:
+        warnings.append(remedy)
+    if doubted:
         warnings.append(f"the run is not to be believed: {bound_text(designed.error_bound, limit)}")
-    if isinstance(program, Tilt) and not program.model.scene.forcing.gravity:
-        warnings.append(
-            "gravity was the same in all training runs, so the fields know no shape that a tilt makes; train "
-            "with scene.forcing.gravity"
-        )
     return warnings

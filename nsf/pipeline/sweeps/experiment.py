@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.canonical import content_hash
@@ -164,7 +164,7 @@ class Experiment:
             return self._reports_of_parts(say, root)
         runs: dict[str, Run] = {}
         fine: dict[str, Run] = {}
-        keys, missing = {}, []
+        keys, configs, missing = {}, {}, []
         for job in self.jobs:
             config = configuration.load(job.overrides)
             pipeline = Pipeline(config, root=root)
@@ -173,7 +173,7 @@ class Experiment:
             except MissingRunError:
                 missing.append(f"{' '.join(job.overrides)}: {_why(pipeline)}")
                 continue
-            runs[run.id], keys[run.id] = run, job.keys
+            runs[run.id], keys[run.id], configs[run.id] = run, job.keys, config
             if "superresolve" in self.stages:
                 try:
                     fine[run.id] = pipeline.evaluated("superresolve")
@@ -188,7 +188,7 @@ class Experiment:
         changed = f", with {' '.join(self.changes)}" if self.changes else ""
         question = Question(
             folder.relative_to(config.report.folder).as_posix(), f"{self.title}{changed}", self.question,
-            self.paper, keys, self.printed, missing, fine, self.plots,
+            self.paper, keys, self.printed, missing, fine, self.plots, _defaults(keys, configs),
         )  # fmt: skip
         said = f"report: {len(runs)} jobs, {len(missing)} missing{changed}"
         if page := unchanged(folder, runs.values(), question):
@@ -235,6 +235,23 @@ class Experiment:
         if not self.placed:
             check_inside(config.report.folder, reports_folder())
         return Path(config.report.folder) / "_".join((self.name, *_short(self.changes)))
+
+
+def _defaults(
+    keys: Mapping[str, Mapping[str, str]], configs: Mapping[str, DictConfig]
+) -> dict[str, dict[str, str]]:
+    """By run id, numbers of keys that its job leaves out and another job of its scene sets."""
+    varied: dict[str, dict[str, None]] = {}
+    for run, job in keys.items():
+        varied.setdefault(configs[run].scene.name, {}).update(dict.fromkeys(job))
+    values = {
+        run: {key: OmegaConf.select(config, key) for key in varied[config.scene.name]}
+        for run, config in configs.items()
+    }
+    return {
+        run: {key: configuration.grammar(one) for key, one in of.items() if type(one) in (int, float)}
+        for run, of in values.items()
+    }
 
 
 def _short(changes: Sequence[str]) -> list[str]:

@@ -56,9 +56,15 @@ def programs(view: View) -> Figures:
         error_scale(panel, np.concatenate([errors for errors, _ in rows.values()]), "x")
         for y, (errors, color) in enumerate(rows.values()):
             _dots(panel, y, errors, color)
+        for model in part["model_name"].unique():  # the rows' names may leave it out
+            panel.plot([], [], "o", ms=4.5, mfc="white", mec=model_color(model), label=model)
         panel.axhline(len(models) - 0.5, color=MUTED, lw=0.8)
         panel.set_yticks(range(len(rows)), in_lines(rows, len(groups)))
         panel.set(title=body, xlabel=ERROR)
+    drawn[0].plot([], [], "|", ms=12, mew=2.4, color=MUTED, label="median")
+    if forced["beyond"].any():
+        drawn[0].plot([], [], "o", ms=4.5, color=MUTED, label="filled: beyond what was taught")
+    legend(fig)
     return {"programs": fig}
 
 
@@ -129,8 +135,10 @@ def _deltas(panel, frame: pd.DataFrame, averages: pd.DataFrame) -> list[float]:
 )
 def delta_over(view: View) -> Figures:
     """δ over each number that the report varies: a panel a scene, a line for each setting of the others."""
-    varied = _varied(view.frame)
-    return {f"delta-over-{file_name(re.sub(r'[._]', '-', key))}": _over(view.frame, key) for key in varied}
+    lines = {key: _lines(view.frame, key) for key in _varied(view.frame)}
+    # A number that only varies along with other settings is no axis.
+    axes = {key: of for key, of in lines.items() if (of.groupby(["body", "line"])[key].nunique() > 1).any()}
+    return {f"delta-over-{file_name(re.sub(r'[._]', '-', key))}": _over(of, key) for key, of in axes.items()}
 
 
 def _varied(frame: pd.DataFrame) -> list[str]:
@@ -148,17 +156,21 @@ def _varied(frame: pd.DataFrame) -> list[str]:
     ]
 
 
-def _over(frame: pd.DataFrame, key: str) -> Figure:
-    """δ over one number."""
+def _lines(frame: pd.DataFrame, key: str) -> pd.DataFrame:
+    """The rows that have a number, with what else they vary as `line`; over sizes a scene is one body."""
     frame = frame[frame[key].notna()]
     bound = [name for name in frame if key.endswith(".particles") and name.startswith("scene.")]
     hidden = [key, *bound, *(["trainer.steps"] if key == "train_seconds" else [])]
     if key == "train_seconds":
         frame = frame.assign(train_seconds=frame.groupby(["body", "variant"])[key].transform("mean"))
-    by = "scene" if bound else "body"
-    frame = frame.assign(line=variants(frame.assign(body=frame[by]), hidden))
+    frame = frame.assign(body=frame["scene" if bound else "body"])
+    return frame.assign(line=variants(frame, hidden))
+
+
+def _over(frame: pd.DataFrame, key: str) -> Figure:
+    """δ over one number, of rows with a `line`."""
     drawn_as = styles(frame, "line")
-    groups = list(frame.groupby(by, sort=False))
+    groups = list(frame.groupby("body", sort=False))
     fig, drawn = panels(len(groups), 2.8, sharex=True)
     for panel, (body, part) in zip(drawn, groups, strict=True):
         every = []

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from nsf.inverse.fit import ModelError
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.reports.command import calibrate, sample
 from nsf.inverse.reports.command import design as command
+from nsf.inverse.reports.design import _warnings
 from nsf.inverse.sampling import Scalars, runs
 from nsf.inverse.space import Space
 from nsf.mpm import Motion
@@ -265,3 +267,23 @@ def test_the_error_of_runs_that_follow_programs(pushed):
     assert moved.shape == (2, 1)
     assert np.abs(moved - unmoved).max() > 0.0
     assert own.deviations.max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("kind", "programs", "missed", "bound", "remedies"),
+    [
+        (Moves, {}, 9.0, 0.1, ["allow wider bounds"]),
+        (Moves, {}, 9.0, np.inf, ["train with more programs", "left what was taught"]),
+        (Tilt, {"tilt": 1}, 9.0, np.nan, ["allow wider bounds"]),
+        (Tilt, {}, 9.0, 0.1, ["train with programs of scene.forcing.gravity"]),
+        (Tilt, {}, 1.0, 0.1, ["train with programs of scene.forcing.gravity"]),
+        (Tilt, {"tilt": 1}, 1.0, 0.1, []),
+    ],
+)
+def test_warnings_of_a_design_have_one_remedy(kind, programs, missed, bound, remedies):
+    program = kind.__new__(kind)
+    forced = SimpleNamespace(forcing=SimpleNamespace(gravity=programs))
+    program.model = SimpleNamespace(scene=forced, trust=SimpleNamespace(limit=0.2))
+    warnings = _warnings(program, SimpleNamespace(error_bound=bound), missed)
+    assert len(warnings) == len(remedies)
+    assert all(remedy in warning for remedy, warning in zip(remedies, warnings, strict=True))

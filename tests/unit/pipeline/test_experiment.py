@@ -4,8 +4,10 @@ import textwrap
 
 import pytest
 
+from nsf import config
 from nsf.errors import ConfigError
-from nsf.pipeline.sweeps.experiment import Experiment
+from nsf.pipeline.sweeps.experiment import Experiment, _defaults
+from nsf.results.question import Question
 
 TEXT = """
 title: A title
@@ -225,3 +227,17 @@ def test_names_of_reports_differ_where_their_settings_do(written, tmp_path, monk
     assert len(set(places)) == len(places) - 1  # the order of overrides is no setting
     assert {place.parent for place in places} == {tmp_path}
     assert max(len(place.name) for place in places) < 120
+
+
+def test_a_job_that_leaves_a_number_out_has_its_default(written):
+    of = "{scene: sand}, {scene: sand, field.noise: 0.1, model.stress: 4, model: recurrence}, {scene: metal}"
+    jobs = written(TEXT[: TEXT.index("jobs:")] + f"jobs: [{of}]").jobs
+    keys = {str(k): job.keys for k, job in enumerate(jobs)}
+    configs = {str(k): config.load(job.overrides) for k, job in enumerate(jobs)}
+    settings = Question("one", "", keys=keys, defaults=_defaults(keys, configs)).settings
+    # Not where no job of the scene sets the key, nor where there is none, or no number.
+    assert settings == {
+        "0": {"field.noise": "0.01"},
+        "1": {"field.noise": "0.1", "model.stress": "4"},
+        "2": {},
+    }

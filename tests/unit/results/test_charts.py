@@ -18,7 +18,7 @@ PLANE = tuple(
 NEEDS = {
     "error_bounds": {"error_bound": [0.02, 0.03, 0.04, 0.05], "fallback_share": 0.0},
     "programs": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
-    "delta_over": {"setting": ["sampler.size=12", "sampler.size=12", "sampler.size=50", "sampler.size=50"]},
+    "delta_over": {"setting": ["sampler.size=12", "sampler.size=50"] * 2},
     "step_over_particles": {"particles": [1000, 1000, 9000, 9000]},
     "error_over_parameters": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
     "error_map": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
@@ -62,11 +62,23 @@ def test_a_chart_is_left_out_where_there_is_nothing_of_its_kind(name):
 def test_every_program_is_a_dot_beside_its_rivals():
     rows = table.labelled(table.complete(frame(Made((0.01, np.inf), PLANE[:2])), "here"))
     panel = errors.programs(View(rows))["programs"].axes[0]
-    dots = {y: line.get_xdata() for line in panel.lines if (y := line.get_ydata()[0]) == line.get_ydata()[-1]}
+    lines = [line for line in panel.lines if len(line.get_ydata())]  # others are of the legend
+    dots = {y: line.get_xdata() for line in lines if (y := line.get_ydata()[0]) == line.get_ydata()[-1]}
     names = [text.get_text().replace("\n", " ") for text in panel.get_yticklabels()]
     assert names[:2] == ["projected", "nothing moves"]
     assert len(dots[0]) == 2
     assert max(dots[0]) == panel.get_xlim()[1]  # lost
+
+
+def test_a_number_that_varies_along_with_another_setting_is_no_axis():
+    coupled = ["field.noise=0.1; field.members=4", "field.noise=0.01; field.members=1"] * 2
+    crossed = [*coupled[:2], "field.noise=0.01; field.members=4", "field.noise=0.1; field.members=1"]
+    drawn = []
+    for settings in (coupled, crossed):
+        rows = pd.concat([frame(Made(model="projected")).assign(setting=one) for one in settings])
+        rows = table.labelled(table.complete(rows.reset_index(drop=True), "here"))
+        drawn.append(sorted(errors.delta_over(View(rows))))
+    assert drawn == [[], ["delta-over-field-members", "delta-over-field-noise"]]
 
 
 def test_a_run_that_diverged_leaves_a_gap_and_is_said():
