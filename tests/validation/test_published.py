@@ -61,21 +61,21 @@ def test_published_deflections_solve_the_elastica(ratio, published):
 
 
 def test_a_block_rests_where_friction_exceeds_the_slope():
-    (way,) = incline.answers(nsf.load_scene("incline", ["scene.colliders.plane.friction=0.58"]), "cpu")
+    (way,) = incline.answers(nsf.load_scene("incline", ["scene.colliders.plane.friction=0.58"]), None, "cpu")
     assert abs(way.computed) < 1e-3
 
 
 def test_taller_columns_run_out_farther():
     """And by less than in proportion to their height."""
     coarse = nsf.load_scene("collapse", ["scene.dx=0.025", "scene.dt=9e-4", "scene.steps=1000"])
-    low, high = (run_out(coarse, a, "cpu") for a in (1.0, 2.0))
+    low, high = (run_out(coarse, a, "cpu")[1] for a in (1.0, 2.0))
     assert low < high < 2.0 * low
 
 
 @pytest.mark.slow
 def test_run_out_grows_with_the_root_of_the_aspect_ratio():
     """Of tall columns, with an exponent of 1/2 within 0.1 (Lube et al. 2004)."""
-    low, tall = (run_out(nsf.load_scene("collapse"), a, "cpu") for a in (6.0, 10.0))
+    low, tall = (run_out(nsf.load_scene("collapse"), a, "cpu")[1] for a in (6.0, 10.0))
     assert math.log(tall / low) / math.log(10.0 / 6.0) == pytest.approx(0.5, abs=0.1)
 
 
