@@ -168,12 +168,17 @@ def _bench(arguments: list[str]) -> int:
 
 def _validate(arguments: list[str]) -> int:
     """Full-order runs beside published answers."""
-    readers = dict.fromkeys(("problems", "scale", "device", "folder"), words.text)
+    readers = dict.fromkeys(("problems", "scenes", "scale", "device", "folder"), words.text)
     options = words.values("validate", arguments, readers)
-    from nsf.validation.command import terminal, validate
+    if "problems" in options and "scenes" in options:
+        raise ConfigError("problems= and scenes= are of two reports; give one of them")
+    from nsf.validation import command, convergence
 
-    folder = options.pop("folder", reports_folder("validation"))
-    page = validate(folder, options, lambda text: print(text, file=sys.stderr))
+    kind, make, terminal = "validation", command.validate, command.terminal
+    if "scenes" in options:
+        kind, make, terminal = "convergence", convergence.converge, convergence.terminal
+    folder = options.pop("folder", reports_folder(kind))
+    page = make(folder, options, lambda text: print(text, file=sys.stderr))
     screen().print(terminal(page))
     return _open(page)
 

@@ -73,9 +73,11 @@ TOOLS = {
         "recurrence, training and peers; all, and sizes that suit the device, by default",
     ),
     "validate": (
-        "problems with published answers at full order, and both in a table; writes reports/validation",
-        "[problems=taylor_bar,cantilever,discs,settling,collapse,incline] [scale=small|paper] [device=cpu] "
-        "[folder=PATH]; all problems by default, in some minutes on a CPU",
+        "problems with published answers at full order, and both in a table; writes reports/validation; or "
+        "the paper's scenes on finer grids, in reports/convergence",
+        "[problems=taylor_bar,cantilever,discs,settling,collapse,incline | scenes=bread,cake,sand,metal,"
+        "toothpaste,jelly_cube,squishy_ball] [scale=small|paper] [device=cpu] [folder=PATH]; all problems by "
+        "default, in some minutes on a CPU",
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }

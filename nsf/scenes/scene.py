@@ -222,11 +222,11 @@ class Scene:
         ends = np.cumsum([0] + [body.particles for body in self.bodies.values()])
         return replace(self, bodies=self._recounted(np.diff(np.rint(particles * (ends / ends[-1])))))
 
-    def coarsened(self, factor: int, multiple: int = 1) -> Self:
+    def coarsened(self, factor: float, multiple: float = 1) -> Self:
         """The same scene on a grid of factor times the spacing, with as many particles a cell.
 
         Args:
-            factor: of Δx; a body's particles become fewer by its third power.
+            factor: of Δx, below 1 for a finer grid; a body's particles become fewer by its third power.
             multiple: of Δt; it divides the steps.
 
         Raises:
@@ -238,7 +238,7 @@ class Scene:
             bodies=self._recounted(counts),
             dx=factor * self.dx,
             dt=multiple * self.dt,
-            steps=self.steps // multiple,
+            steps=round(self.steps / multiple),
         )
 
     def _recounted(self, counts: Sequence[float]) -> dict[str, Body]:
