@@ -20,7 +20,7 @@ class Arena:
         device: Warp device.
 
     Attributes:
-        mode_bytes: of the modes that are held.
+        mode_bytes: of the modes that launches read.
     """
 
     def __init__(self, precision: Precision, device):
@@ -28,6 +28,7 @@ class Arena:
         self.real, self._torch = torch_dtype(precision), torch_device(device)
         self.mode_bytes = 0
         self._buffers: list[torch.Tensor] = []
+        self._tables: list[torch.Tensor] = []  # of others
         self._sides = [wp.Stream(device) for _ in range(3)] if device.is_cuda else []
 
     @contextmanager
@@ -60,10 +61,28 @@ class Arena:
         """Zeros."""
         return self.hold(torch.zeros(shape, device=self._torch), dtype)
 
+    def placed(self, table: torch.Tensor, rows: torch.Tensor, half: bool = True) -> dict[str, torch.Tensor]:
+        """Modes of particles, their lengths and rows: arguments of the kernels with `make_combination`.
+
+        A CPU reads those of the table where they are, which all solvers of a manifold share. A GPU takes them
+        as of `modes`.
+
+        Args:
+            table: [P, c, K]; rows: [n] of the particles.
+            half: whether a GPU has them as of `halved`.
+        """
+        none = self.zeros(1, dtype=self.real)  # modes over no lengths
+        if self.device.is_cuda:
+            modes, lengths = self.halved(table, rows) if half else (self.modes(table, rows), none)
+            return {"modes": modes, "lengths": lengths, "rows": self.zeros(1, dtype=torch.int32)}
+        self.mode_bytes += len(rows) * table[0].nbytes
+        self._tables.append(table.to(self._torch, torch.float32).contiguous())
+        return {"modes": self._tables[-1].flatten(), "lengths": none, "rows": self.hold(rows, torch.int32)}
+
     def modes(
         self,
         table: torch.Tensor,
-        rows: torch.Tensor | None = None,
+        rows: torch.Tensor,
         dtype: torch.dtype = torch.float32,
         lengths: torch.Tensor | float = 1.0,
     ) -> torch.Tensor:
@@ -74,39 +93,35 @@ class Arena:
 
         Args:
             table: [P, c, K].
-            rows: [n] of the particles; all by default.
+            rows: [n] of the particles.
             dtype: of what is held.
             lengths: [K], of which the modes are multiples then.
         """
-        n, (c, K) = len(table) if rows is None else len(rows), table.shape[1:]
+        n, (c, K) = len(rows), table.shape[1:]
         four = -(-K // 4)
         shape = (c, four, n, 4) if self.device.is_cuda else (n, c, four, 4)
         stored = self.hold(torch.zeros(shape, dtype=dtype, device=self._torch), dtype)
         self.mode_bytes += stored.nbytes
         by_particle = stored.permute(2, 0, 1, 3) if self.device.is_cuda else stored
         for part in self._parts(table, rows):
-            values = _rows(table, rows, part).to(self._torch) / lengths
+            values = table[rows[part]].to(self._torch) / lengths
             by_particle[part] = torch.nn.functional.pad(values, (0, -K % 4)).unflatten(2, (four, 4)).to(dtype)
         return stored.flatten()
 
-    def halved(
-        self, table: torch.Tensor, rows: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `modes`, on a GPU in half precision, each over the length [K] that is given beside them.
+    def halved(self, table: torch.Tensor, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `modes`, in half precision, each over the length [K] that is given beside them.
 
         A GPU reads them faster than anything else in a step; no entry exceeds 1, so that none is lost.
         """
-        if not self.device.is_cuda:
-            return self.modes(table, rows), self.hold(torch.ones(table.shape[2]), self.real)
-        largest = [_rows(table, rows, part).abs().amax((0, 1)) for part in self._parts(table, rows)]
+        largest = [table[rows[part]].abs().amax((0, 1)) for part in self._parts(table, rows)]
         lengths = torch.stack(largest).amax(0).clamp_min(torch.finfo(table.dtype).tiny)
         lengths = self.hold(lengths, self.real)
         return self.modes(table, rows, torch.float16, lengths), lengths
 
     @staticmethod
-    def _parts(table: torch.Tensor, rows: torch.Tensor | None) -> list[slice]:
+    def _parts(table: torch.Tensor, rows: torch.Tensor) -> list[slice]:
         """Parts of the rows that are taken at once."""
-        n, size = len(table) if rows is None else len(rows), max(1, _ENTRIES // max(1, table[0].numel()))
+        n, size = len(rows), max(1, _ENTRIES // max(1, table[0].numel()))
         return [slice(start, min(start + size, n)) for start in range(0, n, size)]
 
     def lanes(self, count: int) -> int:
@@ -144,7 +159,3 @@ def _shown(kind, value):
     for name, part in value.items():
         setattr(filled, name, _shown(None, part))
     return filled
-
-
-def _rows(table: torch.Tensor, rows: torch.Tensor | None, part: slice) -> torch.Tensor:
-    return table[part] if rows is None else table[rows[part]]

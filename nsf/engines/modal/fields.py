@@ -46,7 +46,7 @@ def field_launches(
                 heads.append((factors, values))
             else:  # the same in every snapshot, or none
                 values.unflatten(0, (-1, n)).copy_(_as_matrices(factors.mean))
-    stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
+    stored = [arena.placed(factors.table, factors.rows) for factors, _ in heads]
     parameters = torch.stack([setup.parameters for setup in setups])
     networks, outputs = _networks(arena, [f.layers for f, _ in heads], span.record, parameters)
     coefficients = []
@@ -60,16 +60,15 @@ def field_launches(
                 arena.pack(make_at_rate(arena.precision), tuple(coefficients[-1].shape), **arguments)
             )
     fields = [
-        (factors, *modes, a, values)
-        for (factors, values), modes, a in zip(heads, stored, coefficients, strict=True)
+        (factors, placed, a, values)
+        for (factors, values), placed, a in zip(heads, stored, coefficients, strict=True)
     ]
     launches = [_contraction(arena, fields, in_N, tiles)] if fields else []
     if not shared.sources.neural_stress:
         F = arena.zeros(len(span.x), 3, 3, dtype=arena.real)
         factors = shared.manifold.factors("gradient", **options)
-        modes = arena.modes(factors.table, factors.rows)
-        lengths = arena.zeros(1, dtype=arena.real)  # modes over no lengths
-        launches.append(_contraction(arena, [(factors, modes, lengths, a, F)], in_N, tiles))
+        placed = arena.placed(factors.table, factors.rows, half=False)
+        launches.append(_contraction(arena, [(factors, placed, a, F)], in_N, tiles))
         launches.append(_elastic(arena, span, [setup.scene.material for setup in setups], F))
     return networks, launches
 
@@ -141,15 +140,14 @@ def _sides(weights: list, inputs: list, outputs: list) -> list[dict]:
 def _contraction(arena: Arena, fields: Sequence[tuple], in_N: torch.Tensor, tiles: tuple[int, int]):
     """The launch of one or two fields at N.
 
-    A field is its factors, the arena's modes, their lengths, coefficients a [B, K], and the output array.
+    A field is its factors, modes as of `Arena.placed`, coefficients a [B, K], and the output array.
     """
     number, tile = tiles
     sides = []
-    for factors, modes, lengths, a, values in fields:
-        mean = arena.hold(factors.mean, arena.real)
-        sides.append({"mean": mean, "modes": modes, "lengths": lengths, "a": a, "values": values})
+    for factors, placed, a, values in fields:
+        sides.append({"mean": arena.hold(factors.mean, arena.real), **placed, "a": a, "values": values})
     threads = [arena.whole_blocks(f.table.shape[1] // 3 * len(f.rows), THREADS) for f, *_ in fields]
-    four = [-(-a.shape[1] // 4) for *_, a, _ in fields]
+    four = [-(-a.shape[1] // 4) for _, _, a, _ in fields]
     coefficients, stored = (wp.dtype_from_torch(sides[0][name].dtype) for name in ("a", "modes"))
     kernel = make_contraction(arena.precision, (four[0], four[-1]), coefficients, tile, number > 1, stored)
     # One field alone stands on both sides; the second gets no thread.

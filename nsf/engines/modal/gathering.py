@@ -77,7 +77,7 @@ def make_combination(
         sums: one, of a alone, or two.
         tile, several: runs of a tile, from `start` on, and whether there are more tiles.
         coefficients: type of a and b.
-        stored: type of modes; fp16 on a GPU alone, each over its length (`Arena.halved`).
+        stored: type of modes, which are as of `Arena.placed`; fp16 on a GPU alone.
     """
     real = precision.real
     values = wp.types.vector(length=3 * sums * tile, dtype=real)
@@ -89,6 +89,7 @@ def make_combination(
     def combined(
         modes: wp.array(dtype=stored),
         lengths: wp.array(dtype=real),
+        rows: wp.array(dtype=wp.int32),
         a: wp.array2d(dtype=coefficients),
         b: wp.array2d(dtype=coefficients),
         particles: int,
@@ -112,6 +113,7 @@ def _make_field_arrays(precision: Precision, coefficients, stored):
         mean: wp.array2d(dtype=real)
         modes: wp.array(dtype=stored)
         lengths: wp.array(dtype=real)
+        rows: wp.array(dtype=wp.int32)
         a: wp.array2d(dtype=coefficients)
         values: wp.array3d(dtype=real)
 
@@ -142,7 +144,7 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
         if live:  # loaded before all that is waited for below
             middle = vec3(its.mean[p, c], its.mean[p, c + 1], its.mean[p, c + 2])
         value = combined(
-            its.modes, its.lengths, its.a, its.a, its.mean.shape[0], components, start, p, c, live
+            its.modes, its.lengths, its.rows, its.a, its.a, its.mean.shape[0], components, start, p, c, live
         )
         if not live:
             return

@@ -137,6 +137,7 @@ def make_neighbours(
         at: Motion,
         modes: wp.array(dtype=stored),
         lengths: wp.array(dtype=real),
+        rows: wp.array(dtype=wp.int32),
         in_N: wp.array2d(dtype=wp.int32),
         tiles: int,
         lanes: int,
@@ -145,7 +146,7 @@ def make_neighbours(
         start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
         n, of_sample = at.mean.shape[0], at.of_sample
         live = t < n - of_sample
-        moved = combined(modes, lengths, at.a, at.rate, n - of_sample, 3, start, t, 0, live)
+        moved = combined(modes, lengths, rows, at.a, at.rate, n - of_sample, 3, start, t, 0, live)
         if not live:
             return
         p = of_sample + t

@@ -220,13 +220,12 @@ class Placing:
         self.launches = [arena.pack(kernel, B * s * lanes, at=motion, **arguments)]
         if n == s:
             return
-        modes, lengths = arena.halved(deformation.table, deformation.rows[s:])
-        four, kind = -(-state.a.shape[1] // 4), wp.dtype_from_torch(modes.dtype)
+        placed = arena.placed(deformation.table, deformation.rows[s:])
+        four, kind = -(-state.a.shape[1] // 4), wp.dtype_from_torch(placed["modes"].dtype)
         kernel = make_neighbours(precision, shape, four, tile, number > 1, kind)
         threads = number * arena.whole_blocks(n - s, THREADS)
-        arguments = {"modes": modes, "lengths": lengths, "in_N": self.in_N, "tiles": number}
-        arguments["lanes"] = arena.lanes(THREADS)
-        self.launches.append(arena.pack(kernel, threads, THREADS, at=motion, **arguments))
+        arguments = {"in_N": self.in_N, "tiles": number, "lanes": arena.lanes(THREADS)}
+        self.launches.append(arena.pack(kernel, threads, THREADS, at=motion, **placed, **arguments))
 
 
 class Projection:

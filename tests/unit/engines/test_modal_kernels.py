@@ -59,22 +59,30 @@ def test_tiles_hold_all():
     assert tiling(64, 10**6) == (64, 1)
 
 
-def test_half_precision_is_of_a_gpu_and_takes_lengths_out(arena, rng):
+def test_half_precision_takes_lengths_out(arena, rng):
     modes = values_of(arena, rng, 7, 9, 6).float() * torch.logspace(-8, 6, 6, device=arena.zeros(1).device)
-    stored, lengths = arena.halved(modes)
-    if not arena.device.is_cuda:
-        assert stored.dtype is torch.float32
-        assert (lengths == 1).all()
-        return
+    stored, lengths = arena.halved(modes, torch.arange(7, device=modes.device))
     assert stored.dtype is torch.float16
-    found = stored.view(9, 2, 7, 4).permute(2, 0, 1, 3).flatten(2)[..., :6].float() * lengths
+    stored = stored.view(9, 2, 7, 4).permute(2, 0, 1, 3) if arena.device.is_cuda else stored.view(7, 9, 2, 4)
+    found = stored.flatten(2)[..., :6].float() * lengths
     assert ((found - modes).abs().amax((0, 1)) < 1e-3 * modes.abs().amax((0, 1))).all()
+
+
+def test_a_cpu_reads_the_table_itself(rng):
+    arena = Arena(precision_of("fp64"), warp_device("cpu"))
+    table, rows = values_of(arena, rng, 11, 3, 6).float(), torch.tensor([4, 0, 9])
+    before = arena.nbytes
+    placed = arena.placed(table, rows)
+    assert placed["modes"].data_ptr() == table.data_ptr()
+    assert placed["rows"].tolist() == [4, 0, 9]
+    assert (arena.nbytes - before, arena.mode_bytes) == (3 * 4 + 8, 3 * 18 * 4)
 
 
 def test_modes_are_those_of_the_rows_however_many_are_taken_at_once(arena, rng, monkeypatch):
     table = values_of(arena, rng, 11, 3, 6).float()
     rows = torch.tensor([4, 0, 9, 9, 2], device=table.device)
-    whole = [arena.modes(table[rows]), *arena.halved(table[rows])]
+    each = torch.arange(5, device=table.device)
+    whole = [arena.modes(table[rows], each), *arena.halved(table[rows], each)]
     for entries in (1, 50):  # a particle, and two of them, at once
         monkeypatch.setattr("nsf.engines.modal.arena._ENTRIES", entries)
         for found, expected in zip(
@@ -232,8 +240,9 @@ def test_the_inversion_finds_the_latents_that_moved_the_sample(
 def test_modes_are_taken_in_small_parts():
     """A solver's peak is then what it holds, and not several copies of its modes beside."""
     arena, table = Arena(precision_of("fp64"), warp_device("cpu")), torch.ones(6000, 9, 64)
+    rows = torch.arange(6000)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
-        held = arena.modes(table, None, torch.float16, torch.ones(64).double()).nbytes
+        held = arena.modes(table, rows, torch.float16, torch.ones(64).double()).nbytes
     events = recorded.profiler.kineto_results.events()
     changes = sorted((e.start_ns(), e.nbytes()) for e in events if e.name() == "[memory]")
     assert np.cumsum([size for _, size in changes]).max() < held + 2**24

@@ -1,7 +1,7 @@
 // The sums Σ_k modes[p, c + i, k] a_k, i < 3, for each run of a tile, the first of which is `start`; where
-// SUMS is 2, those with b follow those with a. The K modes lie in vectors of four. On a GPU the vectors of
-// neighbouring particles lie side by side (`Arena.modes`): enough loads are then under way to cover the time that
-// memory takes, even for few particles.
+// SUMS is 2, those with b follow those with a. On a GPU the modes lie in vectors of four, and the vectors of
+// neighbouring particles side by side (`Arena.modes`): enough loads are then under way to cover the time that
+// memory takes, even for few particles. On a CPU those of a particle lie together, in a row of the table.
 const int K = a.shape[1], runs = a.shape[0];
 const decltype(a.data) coefficients[] = {a.data, b.data};
 wp::vec_t<3 * SUMS * TILE, real> sum;
@@ -75,13 +75,15 @@ if (live) {
 #else
 if (live) {
     #pragma clang fp reassociate(on)  // a CPU works on several modes at once
-    const wp::float32* first = modes.data + (size_t(p) * components + c) * 4 * Q;
+    const auto row = [&](int of) { return modes.data + (size_t(rows.data[of]) * components + c) * K; };
+    const wp::float32 *first = row(p), *next = row(p + 1 < rows.shape[0] ? p + 1 : p);
+    for (int k = 0; k < 3 * K; k += 16) __builtin_prefetch(next + k);  // rows of neighbours lie apart
     for (int s = 0; s < TILE && start + s < runs; ++s) {
         real found[3 * SUMS] = {};
         for (int k = 0; k < K; ++k)
             for (int m = 0; m < SUMS; ++m)
                 for (int i = 0; i < 3; ++i)
-                    found[3 * m + i] += real(first[4 * Q * i + k]) * real(coefficients[m][(start + s) * K + k]);
+                    found[3 * m + i] += real(first[K * i + k]) * real(coefficients[m][(start + s) * K + k]);
         for (int i = 0; i < 3 * SUMS; ++i) sum[3 * SUMS * s + i] = found[i];
     }
 }
