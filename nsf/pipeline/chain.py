@@ -8,6 +8,7 @@ a chain whose results are all there, takes a second or two.
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -165,7 +166,19 @@ class Pipeline(Configured):
         config = self.template.copy()
         config.model, config.fallback = model, "none"
         config.deploy = OmegaConf.merge(config.deploy, deploy)
-        return Pipeline(config, self.say, self.root)
+        other = Pipeline(config, self.say, self.root)
+        other.device = self.device
+        return other
+
+    def on(self, device: str) -> "Pipeline":
+        """This chain on a device that need not be here, for the names of its runs."""
+        if device == self.device:
+            return self
+        other = copy(self)
+        other.device, other._deployments = device, {}
+        for name in ("validating", "projected"):
+            vars(other).pop(name, None)
+        return other
 
     @property
     def lessons(self) -> list[list[Case]]:

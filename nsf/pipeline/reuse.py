@@ -1,7 +1,6 @@
 """Parts of a chain that are there already: results, trajectories that nothing needs, and the report."""
 
 from collections.abc import Sequence
-from copy import copy
 from pathlib import Path
 
 from nsf.results.question import Question, unchanged
@@ -14,10 +13,8 @@ def evaluated(pipeline, stage: str = "evaluate") -> Run:
     Raises:
         MissingRunError: there is none; says how far it came.
     """
-    for device in (pipeline.device, "cuda:0", "cpu"):
-        there = copy(pipeline)
-        there.device = device
-        (run,) = there.runs_of(stage)
+    for device in dict.fromkeys((pipeline.device, "cuda:0", "cpu")):
+        (run,) = pipeline.on(device).runs_of(stage)
         if run.complete:
             return run
     return pipeline.runs_of(stage)[0].require()

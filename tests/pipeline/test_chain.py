@@ -164,6 +164,16 @@ def test_a_second_run_reuses_every_stage(chain, pipeline_at):
     assert stamps(chain.root) == before
 
 
+def test_results_of_another_device_are_taken(chain, pipeline_at):
+    elsewhere = pipeline_at(chain.root).on("cuda:0")
+    assert elsewhere.evaluation.id != chain.pipeline.evaluation.id
+    assert elsewhere.evaluated().id == chain.pipeline.evaluation.id
+    here = pipeline_at(chain.root, "scene.design.validation=[34]")
+    there = here.on("cuda:0")
+    assert there.deployment.id != here.deployment.id
+    assert there.on("cpu").deployment.id == here.deployment.id
+
+
 def test_another_method_deploys_and_evaluates_again(copied, pipeline_at):
     root = copied(*STAGES)
     before = stamps(root)
