@@ -53,7 +53,7 @@ def arguments(target: str) -> dict[str, str] | None:
 @cache
 def _arguments(path: Path, name: str) -> dict[str, str] | None:
     """Those of a definition in a file: of `__init__`, or the fields of a dataclass and of its bases."""
-    definition = next((node for node in _tree(path).body if getattr(node, "name", None) == name), None)
+    definition = next((node for node in tree_of(path).body if getattr(node, "name", None) == name), None)
     if definition is None and (passed := _imported(path).get(name, path)) != path:
         return _arguments(passed, name)
     if isinstance(definition, ast.FunctionDef):
@@ -115,14 +115,14 @@ def _home(target: str) -> Path | None:
 
 
 def _defines(path: Path, name: str) -> bool:
-    return any(getattr(node, "name", None) == name for node in _tree(path).body)
+    return any(getattr(node, "name", None) == name for node in tree_of(path).body)
 
 
 @cache
 def _imported(path: Path) -> dict[str, Path]:
     """Files of nsf and of the user's packages from which a file takes names, by name."""
     files = {}
-    for node in ast.walk(_tree(path)):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.ImportFrom):
             for alias in node.names:
                 file = _source(path, node, alias.name)
@@ -143,7 +143,8 @@ def _source(path: Path, node: ast.ImportFrom, name: str) -> Path | None:
 
 
 @cache
-def _tree(path: Path) -> ast.Module:
+def tree_of(path: Path) -> ast.Module:
+    """The text of such a file as a tree, parsed once; an empty one of a text that is no program."""
     try:
         return ast.parse(text_of(path))
     except SyntaxError:  # which its import reports

@@ -179,12 +179,12 @@ def resolve(config: DictConfig) -> DictConfig:
 def check(config: DictConfig) -> bytes:
     """The pickled tree of a configuration whose interpolations are resolved, once that is checked."""
     try:
-        return _resolved(_Tree(config), os.environ.get("NSF_REPORTS"))
+        return _resolved(Tree(config), os.environ.get("NSF_REPORTS"))
     except RecursionError as error:
         raise ConfigError("the configuration is nested too deeply; flatten it") from error
 
 
-class _Tree:
+class Tree:
     """A configuration that a cache knows by its content."""
 
     def __init__(self, config: DictConfig):
@@ -195,7 +195,7 @@ class _Tree:
         return hash(self._content)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Tree) and self._content == other._content
+        return isinstance(other, Tree) and self._content == other._content
 
 
 @lru_cache(maxsize=64)
@@ -205,7 +205,7 @@ def _node(tree: bytes) -> bytes:
 
 
 @lru_cache(maxsize=64)
-def _resolved(tree: _Tree, _reports: str | None) -> bytes:
+def _resolved(tree: Tree, _reports: str | None) -> bytes:
     """A pickled tree resolved and checked: jobs ask for the same again. A value may name NSF_REPORTS."""
     plain = resolved(tree.config)
     refuse_keys(plain)

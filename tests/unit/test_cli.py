@@ -211,7 +211,7 @@ BEFORE_ANY_WORK = [
 
 @pytest.mark.parametrize(("override", "quoted"), BEFORE_ANY_WORK, ids=[o for o, _ in BEFORE_ANY_WORK])
 def test_bad_input_of_a_later_stage_is_refused_before_any_work(nsf, monkeypatch, override, quoted):
-    monkeypatch.setattr(simulation_stage(), "simulate", lambda *arguments: pytest.fail("simulate began"))
+    monkeypatch.setattr(simulation_stage(), "make", lambda *arguments: pytest.fail("simulate began"))
     code, _, err = nsf("run", override)
     assert code == 2
     assert len(err.strip().splitlines()) == 1
@@ -221,7 +221,7 @@ def test_bad_input_of_a_later_stage_is_refused_before_any_work(nsf, monkeypatch,
 
 @pytest.mark.parametrize("jobs", [("+experiment=table1/ablation", "scale=small"), ("-m", "latent_dim=4,5")])
 def test_a_place_for_no_report_is_refused_before_the_jobs(nsf, monkeypatch, jobs):
-    monkeypatch.setattr(simulation_stage(), "simulate", lambda *arguments: pytest.fail("simulate began"))
+    monkeypatch.setattr(simulation_stage(), "make", lambda *arguments: pytest.fail("simulate began"))
     code, _, err = nsf("run", *jobs, "report.folder=/proc/reports", tiny_scene=jobs[0] == "-m")
     assert code == 2
     assert len(err.strip().splitlines()) == 1

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
-from nsf.code import text_of, text_sum
+from nsf.code import text_of, text_sum, tree_of
 
 TABLE = Path(__file__).with_name("mirrors.json")
 #: The text that the kernels stand for: classes, of which every function counts, and functions.
@@ -83,7 +83,7 @@ def _digests_on_disk() -> dict[str, str]:
     for mirrored in MIRRORED:
         module, _, name = mirrored.partition(":")
         path = Path(__file__).parents[2].joinpath(*module.split(".")[1:]).with_suffix(".py")
-        for inner, node in _defined(ast.parse(text_of(path)), name):
+        for inner, node in _defined(tree_of(path), name):
             lines = text_of(path).splitlines(keepends=True)
             first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
             digests[f"{mirrored}.{inner}".rstrip(".")] = text_sum("".join(lines[first - 1 : node.end_lineno]))

@@ -16,6 +16,7 @@ from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import experiments, groups, option, reports_folder
 from nsf.pipeline.chain import Pipeline
+from nsf.pipeline.sweeps.chains import chain_of
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 from nsf.scalars import is_finite
@@ -167,7 +168,7 @@ class Experiment:
         keys, configs, missing = {}, {}, []
         for job in self.jobs:
             config = configuration.load(job.overrides)
-            pipeline = Pipeline(config, root=root)
+            pipeline = chain_of(config, root)
             try:
                 run = pipeline.evaluated()
             except MissingRunError:

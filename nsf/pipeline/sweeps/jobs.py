@@ -25,6 +25,7 @@ from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
 from nsf.gpu import has_driver
 from nsf.pipeline.chain import Pipeline
+from nsf.pipeline.sweeps.chains import chain_of
 from nsf.progress import label, labelled, timed
 from nsf.runs import Run
 from nsf.runs.reserved import reserved, reserving
@@ -122,7 +123,7 @@ def sweep(
     def check(one: DictConfig) -> None:
         movable.append(one.device == "auto")
         if "point" not in stages:
-            pipeline = Pipeline(one)
+            pipeline = chain_of(one)
             kept.add(one.data.keep)
             needed.update(pipeline.inputs)
             if not pipeline.complete(_of_chain(pipeline, stages)):

@@ -7,7 +7,7 @@ from typing import Any
 
 from nsf import config as configuration
 from nsf.errors import MissingRunError
-from nsf.pipeline.chain import Pipeline
+from nsf.pipeline.sweeps.chains import chain_of
 from nsf.results.columns import COLUMNS, axis, number
 from nsf.results.formats import Rows
 
@@ -80,7 +80,7 @@ def _words(keys: Mapping[str, str]) -> list[str]:
 def _result(words: Sequence[str]) -> dict[str, Any]:
     """Metrics of a job's evaluate run, ∞ for errors of runs that diverged, and its hash; empty without it."""
     try:
-        run = Pipeline(configuration.load(words)).evaluated()
+        run = chain_of(configuration.load(words)).evaluated()
     except MissingRunError:
         return {}
     metrics = run.manifest["metrics"]
