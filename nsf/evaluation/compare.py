@@ -118,7 +118,11 @@ def compare(
 
     xhat, good = _until_lost(rollout, trajectory.t)
     xhat, X, decoder = tensor(xhat), tensor(trajectory.X), solver.decoder()
-    stress = None if rollout.stress is None else tensor(at_times(trajectory.t, rollout.t, rollout.stress))
+    stress = None
+    if rollout.stress is not None:
+        stress = at_times(trajectory.t, rollout.t, rollout.stress)
+        stress[~good] = stress[good][-1]
+        stress = tensor(stress)
     shown, rows = _Pictures(solver, trajectory, *pictures), {}
     carried = _Carried(solver, trajectory.every) if _carries(solver, rollout, trajectory) else None
     per_chunk = frames_at_once(_VALUES * trajectory.particles, setup.dtype, device)
@@ -276,7 +280,8 @@ class _Pictures:
             "x_full": x[inside][:, self._shown], "x_reduced": x_rom[inside][:, self._shown],
             "stress_full": stress_full, "stress_reduced": stress_reduced,
         }  # fmt: skip
-        arrays = {name: values.float().cpu().numpy() for name, values in kept.items()}
+        # Of a body that is turned inside out a law may have no stress: it is shown as 0.
+        arrays = {name: torch.nan_to_num(values.float()).cpu().numpy() for name, values in kept.items()}
         arrays["role"] = np.array(roles, np.int8).reshape(len(inside), len(self._shown))
         for name, values in arrays.items():
             self._kept.setdefault(name, []).append(values)

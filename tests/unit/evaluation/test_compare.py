@@ -183,6 +183,15 @@ def test_pictures_of_a_diverged_run_hold_its_last_state(lost):
     assert np.isfinite(lost.series["reconstruction_delta"]).all()
 
 
+def test_pictures_of_a_lost_run_with_coordinates_of_stress_are_finite(comparison_of, made):
+    xhat, stress = made.xhat.copy(), np.ones((len(made.t), 2))
+    xhat[10:] = stress[9:] = np.nan
+    stress[8] = 1e60  # beyond fp32, the step before it is lost
+    found = comparison_of(replace(made, xhat=xhat, stress=stress, diverged=9))
+    assert np.isfinite(found.pictures["stress_reduced"]).all()
+    assert found.stress_error == np.inf
+
+
 def test_a_run_lost_between_frames(comparison_of, made):
     """With a longer step, frames just before the lost one lie between a finite and a lost latent."""
     t, xhat = made.t[::2].copy(), made.xhat[::2].copy()
@@ -224,6 +233,7 @@ def test_stress_that_is_not_finite_is_as_far_off_as_can_be(made, comparison_of, 
     assert found.stress_error == found.series["stress_error"][5] == np.inf
     assert np.isfinite(found.series["stress_error"].drop(5)[1:]).all()
     assert (found.delta, found.distance_max) == (whole.delta, whole.distance_max)
+    assert np.isfinite(found.pictures["stress_reduced"]).all()
 
 
 def test_a_truth_that_never_moves_has_no_displacement_error(made, comparison_of, truth, monkeypatch):
