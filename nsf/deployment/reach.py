@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from nsf.recurrence.solids import FEATURES
-from nsf.vectors import drawn
+from nsf.vectors import drawn, lengths
 
 #: Of a value: what float32 may have moved it by.
 _ROUND_OFF = 1e-6
@@ -62,7 +62,7 @@ class Band:
     def together(self, rows: np.ndarray) -> np.ndarray:
         """[...] how far rows [..., f] of one unit are beyond, over half of the diagonal."""
         half = 0.5 * float(np.linalg.norm(self.high - self.low))
-        return np.linalg.norm(self._beyond(rows), axis=-1) / (half or 1.0)
+        return lengths(self._beyond(rows)) / (half or 1.0)
 
     def passed(self, rows: np.ndarray) -> bool:
         """Whether a number of rows [N, f] is further beyond its range than the leeway."""

@@ -22,7 +22,7 @@ from nsf.dynamics import ReducedMPM
 from nsf.errors import SchemaError
 from nsf.recurrence.solids import collider_states
 from nsf.storage import write_json
-from nsf.vectors import spaced
+from nsf.vectors import lengths, spaced
 
 #: File of a deploy run with what bounds the errors of its model.
 TRUST = "trust.json"
@@ -154,7 +154,7 @@ class Trust:
         self.metric, self.limit, self.reach, self.calibration = metric, limit, reach, calibration
         self.validated = np.zeros((0, 0)) if validated is None else validated
         self._taught = taught
-        self._forced = WeakKeyDictionary()  # of runs, by version of their forcing and index: see `_acting`
+        self._forced = WeakKeyDictionary()  # of runs, by version of their forcing: see `outside`
 
     @classmethod
     def of(cls, manifold, limit: float, *further) -> "Trust":
@@ -202,7 +202,7 @@ class Trust:
 
     def moved(self, xhat: np.ndarray) -> np.ndarray:
         """[..., N + 1] RMS displacement [m] of latent vectors [..., N + 1, r] from the first."""
-        return np.linalg.norm((xhat - xhat[..., :1, :]) @ self.metric, axis=-1)
+        return lengths((xhat - xhat[..., :1, :]) @ self.metric)
 
     def signal(
         self, xhat: np.ndarray, members: np.ndarray | None = None, residuals: np.ndarray | None = None
@@ -216,7 +216,7 @@ class Trust:
         """
         if members is not None:
             off = (members - members.mean(0)) @ self.metric
-            return _finite(np.sqrt(np.square(off).sum((0, -1)) / (len(members) - 1)))
+            return _finite(np.sqrt(np.einsum("mnr,mnr->n", off, off) / (len(members) - 1)))
         good = np.isfinite(xhat).all(-1)
         off = np.full(len(xhat), np.inf)
         off[good] = self._nearest.query(xhat[good] @ self.metric)[0]
@@ -239,20 +239,24 @@ class Trust:
         """Why the inputs of a run, in its steps from one on, are outside of what was taught; empty if not."""
         if self.reach is None:
             return ""
-        acting = (values[first - 1 : run.steps_taken] for values in self._acting(run))
-        return self.reach.of_inputs(run.setup.values, *acting, run.dt)
+        version, known = self._forced.get(run.together, (None, None))
+        if version != run.together.batch.forcing.version:  # until a hand acts
+            version, known = run.together.batch.forcing.version, {}
+            self._forced[run.together] = version, known
+        part = run.index, first, run.steps_taken
+        if run.index not in known:
+            known[run.index] = self._acting(run)
+        if part not in known:
+            acting = (values[first - 1 : run.steps_taken] for values in known[run.index])
+            known[part] = self.reach.of_inputs(run.setup.values, *acting, run.dt)
+        return known[part]
 
-    def _acting(self, run: ReducedMPM) -> tuple[np.ndarray, np.ndarray]:
-        """Gravity [N, 3] [m/s²] and states of the colliders [N, f] at every step, until a hand acts."""
+    @staticmethod
+    def _acting(run: ReducedMPM) -> tuple[np.ndarray, np.ndarray]:
+        """Gravity [N, 3] [m/s²] and states of the colliders [N, f] at every step."""
         forcing, steps = run.together.batch.forcing, run.total_steps
-        version, acting = self._forced.setdefault(run.together, (forcing.version, {}))
-        if version != forcing.version:
-            acting = {}
-            self._forced[run.together] = forcing.version, acting
-        if run.index not in acting:
-            solids = collider_states(forcing.colliders_of(run.index), run.dt, steps)
-            acting[run.index] = run.acting_gravity(run.dt * np.arange(steps)), solids
-        return acting[run.index]
+        solids = collider_states(forcing.colliders_of(run.index), run.dt, steps)
+        return run.acting_gravity(run.dt * np.arange(steps)), solids
 
     def of_run(self, run: ReducedMPM, signal: np.ndarray, diverged: int = -1) -> Verdict:
         """The verdict on a run, at its end or in its midst.
@@ -286,13 +290,14 @@ class Trust:
         """
         finite = np.isfinite(xhat).all(-1)
         finite[diverged if diverged >= 0 else len(t) :] = False
-        rows = np.where(finite[:, None], xhat, xhat[:1]) @ self.metric
-        displacement = float(rms(np.linalg.norm(rows - rows[0], axis=-1)))
+        lost = not finite.all()
+        rows = (np.where(finite[:, None], xhat, xhat[:1]) if lost else xhat) @ self.metric
+        displacement = float(rms(lengths(rows - rows[0])))
         beyond, why = bool(outside), outside
         if self.reach is not None and not beyond:
-            left = np.flatnonzero(self.reach.of_states(rows[finite]))
-            if beyond := bool(len(left)):
-                why = f"its shape left those of the training runs at t = {t[finite][left[0]]:.3g} s"
+            left = self.reach.of_states(rows[finite] if lost else rows)
+            if beyond := bool(left.any()):
+                why = f"its shape left those of the training runs at t = {t[finite][left.argmax()]:.3g} s"
         if diverged >= 0:
             why = why or f"it diverged at t = {t[diverged]:.3g} s"
         if self.calibration is None:
@@ -301,7 +306,8 @@ class Trust:
         else:
             displacement = displacement if whole else max(displacement, self.calibration.displacement)
             bound = self._away(values) * self.calibration.bound(t, signal, displacement)
-            bound[~finite] = np.inf
+            if lost:
+                bound[~finite] = np.inf
             share = self.calibration.share
             if not why and not len(self.calibration.errors):
                 why = "every validation run was lost"
@@ -314,11 +320,14 @@ class Trust:
         """Factor on a bound: 1 in a validation case, more the further away a case is."""
         if self.reach is None or not self.validated.size:
             return 1.0
-        at = np.array([values[name] for name in self.reach.names])
-        low, high = self.reach.box.T
-        varies = high > low
-        sides = np.abs(self.validated - at)[:, varies] / (high - low)[varies]
+        sides = np.abs(self.validated - [values[name] for name in self.reach.names]) / self._sides
         return 1.0 + _AWAY * float(sides.max(1, initial=0.0).min())
+
+    @cached_property
+    def _sides(self) -> np.ndarray:
+        """[p] sides of the box of parameters; ∞ where one does not vary, where none is away."""
+        low, high = self.reach.box.T
+        return np.where(high > low, high - low, np.inf)
 
     def calibrated(
         self, reach: Reach, cases: Sequence[Mapping[str, float]], calibration: Calibration
