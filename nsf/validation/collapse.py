@@ -49,23 +49,25 @@ def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
     reach = {}
     for a in _RATIOS:
         solver, reach[a] = run_out(scene, a, device)
-        yield _answer(solver, a, reach[a])
+        yield _answer(solver, a, reach[a], limit="cells; the floor's friction" if a in _RATIOS[:2] else "")
     low, tall = _RATIOS[-2:]
     exponent = np.log(reach[tall] / reach[low]) / np.log(tall / low)
     quantity = f"exponent, a from {low:g} to {tall:g}"
-    yield Answer.of(solver, quantity, "-", (0.5,), _SOURCE, float(exponent))
+    limit = "two run-outs, whose own errors it has"
+    yield Answer.of(solver, quantity, "-", (0.5,), _SOURCE, float(exponent), limit=limit)
     grains = scene.changed(_ANGLE)
-    changed = [(1.0, grains, ", 22.8°"), (6.0, grains, ", 22.8°")]
+    changed = [(1.0, grains, ", 22.8°", "cells"), (6.0, grains, ", 22.8°", "the grains' angle")]
     if finer:
-        changed += [(a, finer, ", half the cell") for a in _RATIOS[:2]]
-        changed += [(1.0, finer.changed(_ANGLE), ", half the cell, 22.8°")]
-        changed += [(1.0, finer.changed(_FLOOR), ", half the cell, floor 0.3")]
-    for a, other, addition in changed:
+        changed += [(a, finer, ", half the cell", "the floor's friction; cells") for a in _RATIOS[:2]]
+        changed += [(1.0, finer.changed(_ANGLE), ", half the cell, 22.8°", "the grains' angle")]
+        changed += [(1.0, finer.changed(_FLOOR), ", half the cell, floor 0.3", "the floor's friction")]
+    for a, other, addition, limit in changed:
         solver, value = run_out(other, a, device)
-        yield _answer(solver, a, value, addition)
+        yield _answer(solver, a, value, addition, limit)
 
 
-def _answer(solver: FullOrderMPM, a: float, value: float, addition: str = "") -> Answer:
+def _answer(solver: FullOrderMPM, a: float, value: float, addition: str = "", limit: str = "") -> Answer:
     """A run-out beside the published one."""
     published = 1.6 * a**0.5 if a > _ROOT else 1.24 * a
-    return Answer.of(solver, f"ΔR/R at a = {a:g}{addition}", "-", (published,), _SOURCE, value)
+    quantity = f"ΔR/R at a = {a:g}{addition}"
+    return Answer.of(solver, quantity, "-", (published,), _SOURCE, value, limit=limit)

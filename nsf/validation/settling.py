@@ -10,10 +10,12 @@ from nsf.validation.problem import Answer, relax, spread
 
 TITLE = "Column under its own weight"
 LIMITS = (
-    "the lowest cell, whose strain the floor holds; and quadrature, as compression moves particles off "
-    "the lattice. Particles spread as in other scenes are noisy from the start: the last row."
+    "the lowest cells, whose strain the floor holds: single particles are 6.1 % off with them, 2.1 % "
+    "above one cell, 1.0 % above two and 0.5 % above four. Particles spread as in other scenes are "
+    "noisy from the start: the last row."
 )
 _SOURCE = "closed form: equilibrium, σ = ρ₀ g (l₀ − y₀)"
+_HELD = 2  # cells above the floor that the second distance leaves out
 
 
 def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
@@ -22,9 +24,16 @@ def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
     slope = float(np.polyfit(exact, stress, 1)[0])
     yield Answer.of(solver, "stress over ρ₀ g (l₀ − y₀), slope", "-", (1.0,), _SOURCE, slope)
     quantity = "single particles' distance from it"
-    yield Answer.of(solver, quantity, "%", (0.0,), _SOURCE, distance(stress, exact))
+    limit = "the lowest cell, at the floor"
+    yield Answer.of(solver, quantity, "%", (0.0,), _SOURCE, distance(stress, exact), limit=limit)
+    column = scene.bodies["column"].shape
+    above = solver.constants.X[:, 2] > column.lower[2] + _HELD * scene.dx
+    quantity = f"the same, {_HELD} cells above the floor"
+    yield Answer.of(solver, quantity, "%", (0.0,), _SOURCE, distance(stress[above], exact[above]))
     solver, stress, exact = stresses(spread(scene, "column"), device)
-    yield Answer.of(solver, "the same, particles spread", "%", (0.0,), _SOURCE, distance(stress, exact))
+    limit = "particles off the lattice, as other scenes have them"
+    quantity = "the same, particles spread"
+    yield Answer.of(solver, quantity, "%", (0.0,), _SOURCE, distance(stress, exact), limit=limit)
 
 
 def stresses(scene: Scene, device: str) -> tuple[FullOrderMPM, np.ndarray, np.ndarray]:
