@@ -89,7 +89,7 @@ def _maps(view: View, planes: list) -> Figure:
     for across, (body, names, ranked) in zip(grid, rows, strict=True):
         for panel, (variant, cases) in zip(across, ranked, strict=False):
             _map(panel, view, cases, names, scale)
-            title = [body, *textwrap.wrap(variant, _WIDEST), _summary(_within(cases))]
+            title = [body, *textwrap.wrap(variant, _WIDEST), _summary(cases)]
             panel.set_title("\n".join(title), fontsize=9, fontweight="normal")
         for panel in across[len(ranked) :]:
             panel.axis("off")
@@ -195,10 +195,10 @@ def _within(cases: pd.DataFrame) -> pd.Series:
     return cases["error"][~cases["beyond"] | cases["beyond"].all()]
 
 
-def _summary(errors: pd.Series) -> str:
-    """The mean, or how many are lost."""
-    lost = int((~(100 * errors <= LOST)).sum())
-    return f"{lost} of {len(errors)} lost" if lost else f"mean {number(errors.mean(), 100)} %"
+def _summary(cases: pd.DataFrame) -> str:
+    """The mean of those within what was taught, or how many of all are lost."""
+    lost = int(cases["lost"].sum())
+    return f"{lost} of {len(cases)} lost" if lost else f"mean {number(_within(cases).mean(), 100)} %"
 
 
 def _rank(errors: pd.Series) -> tuple[int, float]:

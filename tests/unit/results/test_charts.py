@@ -118,8 +118,10 @@ def test_a_chart_is_added_by_one_function(monkeypatch):
 
 
 def test_lost_runs_are_no_colour_of_a_map():
-    assert cases._summary(pd.Series([0.1, np.inf])) == "1 of 2 lost"
-    assert cases._summary(pd.Series([0.1, 0.3])) == "mean 20 %"
+    runs = pd.DataFrame({"error": [0.1, 0.3, np.inf], "lost": [False, False, True], "beyond": False})
+    assert cases._summary(runs) == "1 of 3 lost"
+    assert cases._summary(runs[:2]) == "mean 20 %"
+    assert cases._summary(runs[:2].assign(beyond=[False, True])) == "mean 10 %"
 
 
 def test_a_name_beside_an_axis_is_part_of_a_chart():
