@@ -11,7 +11,7 @@ from nsf.mpm import FullOrderMPM
 from nsf.scenes import Box, Scene
 
 #: Steps from one look at the kinetic energy to the next; looks, at most, until a body is at rest.
-_BETWEEN, _LOOKS = 10, 20_000
+_BETWEEN, _LOOKS = 10, 5_000
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Answer:
         return 100.0 * (self.computed / nearest - 1.0) if nearest else self.computed
 
 
-def relax(solver: FullOrderMPM, load: Callable[[], object] = lambda: None, still: float = 1e-8) -> None:
+def relax(solver: FullOrderMPM, load: Callable[[], object] = lambda: None, still: float = 3e-8) -> None:
     """Bring a body to rest by kinetic damping: at each peak of kinetic energy all velocities become zero.
 
     Args:
