@@ -144,7 +144,7 @@ class MemoryProbe:
 
         with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
             ...
-        probe.peak_mib, probe.grown_mib, probe.allocators
+        probe.peak_mib, probe.grown_mib
 
     On CUDA the peak is the sum of the peaks of torch's allocator and Warp's memory
     pool. This is an upper bound, because the two may not coincide. Warp cannot
@@ -159,14 +159,11 @@ class MemoryProbe:
     Attributes:
         peak_mib: [MiB] most memory held at a time.
         grown_mib: [MiB] `peak_mib` less the memory held on entry.
-        allocators: [MiB] by allocator; "driver" is all memory in use on the
-            device at the end, with other processes and loaded kernels.
     """
 
     def __init__(self, device: Any = "cpu", nbytes: int | Callable[[], int] = 0) -> None:
         self.device = device
         self.peak_mib = self.grown_mib = 0.0
-        self.allocators: dict[str, float] = {}
         self._nbytes = nbytes
         self._torch = self._warp = None
         if _is_cuda(device):
@@ -188,21 +185,16 @@ class MemoryProbe:
     def __exit__(self, *exception: object) -> None:
         if not _is_cuda(self.device):
             nbytes = self._nbytes() if callable(self._nbytes) else self._nbytes
-            self.allocators = {"solver": nbytes / _MIB}
             self.peak_mib = self.grown_mib = nbytes / _MIB
             return
-        now = self._current()
-        peak = dict(now)
+        peak = self._current()
         if self._torch:
             peak["torch"] = self._torch.cuda.max_memory_allocated(str(self.device))
         if self._warp:
             mark = self._warp.get_mempool_used_mem_high(str(self.device))
-            peak["warp"] = mark if mark > self._mark else max(now["warp"], self._held["warp"])
+            peak["warp"] = mark if mark > self._mark else max(peak["warp"], self._held["warp"])
         self.peak_mib = sum(peak.values()) / _MIB
         self.grown_mib = self.peak_mib - sum(self._held.values()) / _MIB
-        self.allocators = {name: size / _MIB for name, size in peak.items()} | {
-            "driver": self._driver() / _MIB
-        }
 
     def _current(self) -> dict[str, int]:
         held = {}
@@ -211,15 +203,6 @@ class MemoryProbe:
         if self._warp:
             held["warp"] = self._warp.get_mempool_used_mem_current(str(self.device))
         return held
-
-    def _driver(self) -> int:
-        if self._torch:
-            free, total = self._torch.cuda.mem_get_info(str(self.device))
-            return total - free
-        if self._warp:
-            device = self._warp.get_device(str(self.device))
-            return device.total_memory - device.free_memory
-        return 0
 
 
 def _is_cuda(device: Any) -> bool:

@@ -2,7 +2,7 @@
 
 import gc
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -40,7 +40,6 @@ class SolverCost:
         stages: median over steps spread through a run of each stage's time [ms]; on a GPU within the
             captured step, where steps are captured, else synchronised, so that their sum may exceed a step.
         memory_mib: peak of every allocator during the first run, beyond what was held before it [MiB].
-        allocators: the same by allocator [MiB].
         trials: number of runs; steps: of each.
     """
 
@@ -50,13 +49,8 @@ class SolverCost:
     total_ms: float
     stages: dict[str, float]
     memory_mib: float
-    allocators: dict[str, float]
     trials: int
     steps: int
-
-    def as_dict(self) -> dict:
-        """Plain containers."""
-        return asdict(self)
 
 
 def measure(
@@ -73,12 +67,12 @@ def measure(
         device: `cpu`, `cuda` or `cuda:N`.
         advance: called after each run; of each solver there is one more, in which stages are timed.
     """
-    memory: dict[str, tuple] = {}
+    memory: dict[str, float] = {}
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in subjects}
     for trial in range(trials):
         for name, subject in subjects.items():
             if trial == 0:
-                taken, *memory[name] = _first_trial(subject, device)
+                taken, memory[name] = _first_trial(subject, device)
             else:
                 taken = _times(subject.build(), subject.steps, device)
             times[name].append(taken)
@@ -93,8 +87,7 @@ def measure(
             step_ms_p90=p90,
             total_ms=float(np.median(totals)),
             stages=_stages(subject, trials, device),
-            memory_mib=memory[name][0],
-            allocators=memory[name][1],
+            memory_mib=memory[name],
             trials=trials,
             steps=subjects[name].steps,
         )
@@ -125,8 +118,8 @@ def decoding_ms(solver: ReducedMPM, rollout: Rollout, trials: int) -> float:
     return float(np.median([elapsed_ms(decode, wait) for _ in range(trials + 1)][1:]))
 
 
-def _first_trial(subject: Subject, device: str) -> tuple[tuple[float, float], float, dict[str, float]]:
-    """Times as `_times`, and peak memory beyond what was held before, whole and by allocator [MiB]."""
+def _first_trial(subject: Subject, device: str) -> tuple[tuple[float, float], float]:
+    """Times as `_times`, and peak memory beyond what was held before [MiB]."""
     gc.collect()  # what an earlier solver left behind; slow, so only where memory is measured
     with MemoryProbe(device) as before:
         pass
@@ -134,7 +127,7 @@ def _first_trial(subject: Subject, device: str) -> tuple[tuple[float, float], fl
     gc.collect()
     with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
         taken = _times(solver, subject.steps, device)
-    return taken, probe.peak_mib - before.peak_mib, probe.allocators
+    return taken, probe.peak_mib - before.peak_mib
 
 
 def _times(solver, steps: int, device: str) -> tuple[float, float]:

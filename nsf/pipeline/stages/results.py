@@ -38,7 +38,7 @@ def costs(measured: Mapping[str, SolverCost], decode_ms: float) -> dict:
     if not measured:
         return {"trials": 0}
     breakdown = {name: measured[name].stages for name in ("reduced", "full_order")}
-    solvers = {name: cost.as_dict() for name, cost in measured.items()}
+    solvers = {name: asdict(cost) for name, cost in measured.items()}
     trials = measured["reduced"].trials
     return {"trials": trials, "decode_ms": decode_ms, "breakdown": breakdown, **solvers}
 
