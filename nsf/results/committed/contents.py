@@ -48,6 +48,7 @@ def page_of(reports: "Reports") -> str:
         note=reports.contents["note"],
         chapters={heading: entries for heading, entries in chapters.items() if entries},
         definitions=report.definitions(_EXPLAINED),
+        long=_LONG,
         of_the_paper=figures if any(paths for *_, paths in figures) else [],
     )
 
@@ -60,7 +61,6 @@ def _section(reports: "Reports", name: str) -> dict:
         averages = averages.loc[
             sorted(averages.groupby("body", sort=False)["displacement_error"].idxmin().dropna())
         ]
-        said.append("The best of each scene.")
     if averages["variant"].nunique() == 1:
         said.append(f"Model: {averages['model_name'].iloc[0]}.")
     varying = [c for c in _COLUMNS if c != "variant" or averages[c].nunique() > 1]
