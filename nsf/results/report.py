@@ -44,14 +44,14 @@ _IDENTITY = (
     *("seed", "setting", "split", "precision", "device"),
 )
 _MEANS = (
-    *("body", "variant", "case", "cases", "diverged", "paper_delta", "delta", "delta_interval"),
-    *("displacement_error", "displacement_worst", "stress_error", *RIVALS, "delta_static"),
+    *("body", "variant", "case", "cases", "diverged", "displacement_error", "displacement_worst"),
+    *("stress_error", *RIVALS, "paper_delta", "delta", "delta_interval", "delta_static"),
     *("gamma", "sample", "integration_share", "step_ms_full", "step_ms", "total_ms", "decode_ms"),
     *("speedup_step", "speedup_total", "speedup_decoded", "memory_full_mib", "memory_mib"),
     *("train_seconds", "teach_seconds", "ready_seconds", "break_even_runs", "fallback_share"),
 )
 _EACH = (
-    *("body", "variant", "seed", "sampler.seed", "case", "delta", "displacement_error", "stress_error"),
+    *("body", "variant", "seed", "sampler.seed", "case", "displacement_error", "stress_error", "delta"),
     *("error_bound", "flag", "flag_reason", "distance", "distance_max", "fallback_share", *QUANTITIES),
 )
 _PASSING = ("evaluation.", "data.", "super_resolution.", "report.")  # keys that tell no models apart

@@ -14,6 +14,10 @@ from nsf.results.formats import terminal
 
 #: Of a body that never moves the error is 100 %.
 _RIVALS = [name for name in RIVALS if name != "displacement_static"]
+_LIGHTS = {
+    "green": "green (at most half of trust.limit, 10 % by default)",
+    "red": "red (above trust.limit, or beyond what was taught)",
+}
 
 
 def verdict(frame: pd.DataFrame) -> list[tuple[str, str]]:
@@ -61,10 +65,9 @@ def _bound(frame: pd.DataFrame) -> str:
         return ""
     ends = " to ".join(dict.fromkeys(number(end, 100) for end in (bounds.min(), bounds.max())))
     held = int((frame["displacement_error"] <= bounds).sum())
-    flags = ", ".join(f"{count} {flag}" for flag, count in frame["flag"].value_counts().items() if flag)
-    lights = f"; {flags}" * bool(flags)
-    if "green" in flags:
-        lights += " (at most half of trust.limit, 10 % by default)"
+    counts = frame["flag"].value_counts().items()
+    flags = [f"{count} {_LIGHTS.get(flag, flag)}" for flag, count in counts if flag]
+    lights = "; ".join(["", *flags])
     return f"{ends} %, to hold in 90 % of runs, held by {held} of {len(frame)} runs{lights}"
 
 

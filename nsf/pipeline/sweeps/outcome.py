@@ -40,7 +40,8 @@ def outcome(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> tuple
             result["run"] = "failed" if " ".join(setting) in failed else "not evaluated"
     leaves = [key.rpartition(".")[2] for key in varied]
     names = [leaf if leaves.count(leaf) == 1 else key for key, leaf in zip(varied, leaves, strict=True)]
-    shown = [COLUMNS[name] for name in (*_ERRORS, *_TIMES)]
+    timed = [name for name in _TIMES if any(name in result for result in results)]
+    shown = [COLUMNS[name] for name in (*_ERRORS, *timed)]
     headings = [*names, axis("validation error", "%"), "run", *(one.heading for one in shown)]
     body = [
         [

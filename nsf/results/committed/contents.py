@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 INDEX = "index.md"
 _COLUMNS = (
-    *("body", "variant", "case", "paper_delta", "delta", "displacement_error", "displacement_interpolated"),
+    *("body", "variant", "case", "displacement_error", "displacement_interpolated", "paper_delta", "delta"),
     *("speedup_decoded", "stress_error"),
 )
 _WIDE, _LONG = 7, 14  # columns and rows of a table of the page
-_EXPLAINED = ("delta", "displacement_error", "stress_error", "displacement_interpolated")
+_EXPLAINED = ("displacement_error", "displacement_interpolated", "stress_error", "delta")
 #: Of the record of a report that has files of its own.
 _LISTED = ANY | {
     Maybe("chart"): ({"file": str}, None),
