@@ -58,7 +58,7 @@ def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
     grains = scene.changed(_ANGLE)
     changed = [(1.0, grains, ", 22.8°", "cells"), (6.0, grains, ", 22.8°", "the grains' angle")]
     if finer:
-        changed += [(a, finer, ", half the cell", "the floor's friction; cells") for a in _RATIOS[:2]]
+        changed += [(1.0, finer, ", half the cell", "the floor's friction; cells")]
         changed += [(1.0, finer.changed(_ANGLE), ", half the cell, 22.8°", "the grains' angle")]
         changed += [(1.0, finer.changed(_FLOOR), ", half the cell, floor 0.3", "the floor's friction")]
     for a, other, addition, limit in changed:
