@@ -9,10 +9,11 @@ from expand import variants
 from nsf import config
 from nsf.bench import BENCHES
 from nsf.cli import TOOLS, main
-from nsf.paths import EXPERIMENTS
+from nsf.paths import EXPERIMENTS, groups
 from nsf.pipeline import Pipeline
 from nsf.pipeline.sweeps.experiment import Experiment
 from nsf.pipeline.sweeps.search import Range
+from nsf.validation.command import PROBLEMS
 
 ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)
@@ -43,6 +44,8 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
         ranges = [Range.parse(word) for word in words]
         assert any(ranges)
         Pipeline(config.load([word for word, found in zip(words, ranges, strict=True) if not found])).check()
+    elif name == "validate":
+        _check_validated(words)
     elif name in TOOLS:
         if name == "bench":
             words = _quick(words)
@@ -50,10 +53,9 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
                 return
             _MEASURED.add(tuple(words))
         monkeypatch.setenv("NSF_RUNS", str(folder / "runs"))
-        # What is only checked are the committed reports.
-        reports = ROOT / "reports" if "check=true" in words else folder / "reports"
-        monkeypatch.setenv("NSF_REPORTS", str(reports))
-        reports.mkdir(exist_ok=True)
+        # Without reports: `make check-reports` draws the committed ones.
+        monkeypatch.setenv("NSF_REPORTS", str(folder / "reports"))
+        (folder / "reports").mkdir(exist_ok=True)
         monkeypatch.setattr("webbrowser.open", lambda address: True)
         with pytest.MonkeyPatch.context() as patch:
             # The others are built in test_experiments.py.
@@ -64,6 +66,13 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
         assert not ended.value.code or "no complete deploy run" in capsys.readouterr().err
     else:
         _build(command, experiments)
+
+
+def _check_validated(words: list[str]) -> None:
+    """Whether there are the problems and scenes that `nsf validate` runs; tests/validation runs them."""
+    given = dict(word.split("=", 1) for word in words)
+    known = {"problems": PROBLEMS, "scenes": groups()["scene"]}
+    assert all(set(values.split(",")) <= set(known[key]) for key, values in given.items())
 
 
 def _quick(words: list[str]) -> list[str]:
