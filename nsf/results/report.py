@@ -299,7 +299,7 @@ def findings(view: View) -> list[str]:
     compared = compared[compared["stress"].ne("deformation")]
     if len(compared):
         below = int((compared["delta"] < compared["paper_delta"]).sum())
-        sentences.append(f"δ is below the paper's in {below} of {len(compared)} rows that it prints.")
+        sentences.append(f"δ is below the paper's in {below} of {len(compared)} rows.")
     if won := where_rivals_win(averages):
         sentences.append(won)
     if lost := int(np.isinf(frame["delta"]).sum()):
@@ -350,7 +350,7 @@ def commit_text(origin: Mapping) -> str:
         return f"nsf {(origin.get('versions') or {}).get('nsf') or '(version unknown)'}"
     commit = str(origin["commit"])[:12]
     if origin.get("dirty") is None:
-        return f"{commit} (state of the tree unknown)"
+        return f"{commit} (tree unknown)"
     return f"{commit} + uncommitted changes" if origin["dirty"] else commit
 
 
