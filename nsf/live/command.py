@@ -13,7 +13,7 @@ from nsf.errors import ConfigError
 from nsf.extras import optional
 from nsf.live import LOOPBACK
 from nsf.runs import Run
-from nsf.words import positive, whole
+from nsf.words import flag, positive, whole
 
 if TYPE_CHECKING:
     from nsf.live.player import Player
@@ -22,7 +22,21 @@ PORTS = {"view": 8080, "serve": 8765}
 
 
 class Parser(argparse.ArgumentParser):
-    """Of options with dashes, which are refused as words are."""
+    """Of options with dashes or, as all other commands take them, `key=value`."""
+
+    def parse_args(self, arguments: Sequence[str]) -> argparse.Namespace:
+        """The options; a `key=value` is that of the option `--key`, and `run=` the run."""
+        return super().parse_args([dashed for word in arguments for dashed in self._dashed(word)])
+
+    def _dashed(self, word: str) -> list[str]:
+        key, equals, value = word.partition("=")
+        if not equals or not key.isidentifier():
+            return [word]
+        if key == "run":
+            return [value]
+        if (option := self._option_string_actions.get(f"--{key}")) is None:
+            self.error(f"no key {key!r}")
+        return [f"--{word}"] if option.nargs != 0 else [f"--{key}"] * flag(key, value)
 
     def error(self, message: str):
         """Refuse the options."""

@@ -22,8 +22,15 @@ def export(chain, tmp_path, monkeypatch, capsys):
     return call
 
 
-def test_a_run_by_its_hash(export, chain, deployed, tmp_path):
-    code, out, err = export(deployed.hash[:6], "--html", "--vtk", "--every", "12", "--device", "cpu")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["{run}", "--html", "--vtk", "--every", "12", "--device", "cpu"],
+        ["run={run}", "html=true", "vtk=true", "usd=false", "every=12", "device=cpu"],
+    ],
+)
+def test_a_run_by_its_hash(export, chain, deployed, tmp_path, words):
+    code, out, err = export(*(word.format(run=deployed.hash[:6]) for word in words))
     assert (code, err) == (0, "")
     folder = tmp_path / "reports/export" / f"sand-{deployed.hash}"
     assert {p.name for p in folder.iterdir()} == {"friction_angle_26.html", "friction_angle_26.vtkhdf"}
