@@ -21,6 +21,7 @@ _SOURCE = (
     "sand, salt, couscous, rice and sugar on wood, baize, Plexiglas and sandpaper"
 )
 _RATIOS, _ROOT = (1.0, 3.0, 6.0, 10.0), 1.7  # aspect ratios a, and that above which the run-out is a root
+_LIMITS = dict.fromkeys((1.0, 3.0), "cells; the floor's friction") | {10.0: "the grains' angle, as at a = 6"}
 #: Other friction, one value changed: of the grains [°], of the floor.
 _ANGLE, _FLOOR = {"material.friction_angle": 22.8}, {"colliders.floor.friction": 0.3}
 _SHARES = np.linspace(0.9, 0.99, 10)  # of the mass, from whose radii the edge is extrapolated
@@ -49,7 +50,7 @@ def answers(scene: Scene, finer: Scene | None, device: str) -> Iterator[Answer]:
     reach = {}
     for a in _RATIOS:
         solver, reach[a] = run_out(scene, a, device)
-        yield _answer(solver, a, reach[a], limit="cells; the floor's friction" if a in _RATIOS[:2] else "")
+        yield _answer(solver, a, reach[a], limit=_LIMITS.get(a, ""))
     low, tall = _RATIOS[-2:]
     exponent = np.log(reach[tall] / reach[low]) / np.log(tall / low)
     quantity = f"exponent, a from {low:g} to {tall:g}"
