@@ -28,7 +28,6 @@ from nsf.pipeline.durations import measured
 from nsf.pipeline.reuse import question_of
 from nsf.pipeline.tracking import Tracked
 from nsf.progress import START, timed
-from nsf.results.folder import check_place
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.scenes.designs import random_cases
@@ -263,15 +262,6 @@ class Pipeline(Configured):
     def report_folder(self) -> Path:
         """Where the report goes."""
         return Path(self.config.report.folder) / self.config.report.name
-
-    def check_report_folder(self) -> None:
-        """Refuse a place where no report could be written.
-
-        Raises:
-            ConfigError: something else stands there.
-            StorageError: the folder above it cannot be written.
-        """
-        check_place(self.report_folder)
 
     # -- the work ----------------------------------------------------------------------------------------
 

@@ -27,6 +27,7 @@ from nsf.gpu import has_driver
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.sweeps.chains import chain_of
 from nsf.progress import label, labelled, timed
+from nsf.results.folder import check_place
 from nsf.runs import Run
 from nsf.runs.reserved import reserved, reserving
 from nsf.terminal import guard
@@ -67,7 +68,7 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         stages = _of_chain(pipeline, stages)
         _ = pipeline.held_out  # refused before hours of simulation and training, not after
     if "report" in stages:
-        pipeline.check_report_folder()
+        check_place(pipeline.report_folder)
     pipeline.group = group
     needs_others = len(stages) > 1 and not pipeline.complete(stages)
     if needs_others and not group:
@@ -184,7 +185,7 @@ def check_report_folders(overrides: Sequence[str]) -> None:
         StorageError: the folder above it cannot be written.
     """
     for pipeline in _reporting(overrides):
-        pipeline.check_report_folder()
+        check_place(pipeline.report_folder)
 
 
 def _reporting(overrides: Sequence[str], say: Callable[[str], object] = print) -> list[Pipeline]:
