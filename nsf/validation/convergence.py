@@ -45,8 +45,8 @@ _NOTE = (
     "over 7e7 steps of a particle, on a CPU. order p: from these two, as the error of a grid is taken to "
     "be C hᵖ. grid: the error of the scene's grid by this order; – where the two tell none: where they go "
     "on growing it is more than `third`. sampling: other particles on the same grid, carried to those of "
-    "the scene: the floor of an error. projected, recurrence: means over the test cases and seeds of "
-    "`table1/small`."
+    "the scene; a smaller error tells of these particles, not of the body. projected, recurrence: means "
+    "over the test cases and seeds of `table1/small`."
 )
 _COLUMNS = {
     "half": "half [%]", "third": "third [%]", "grid": "grid [%]", "sampling": "sampling [%]",
@@ -54,7 +54,8 @@ _COLUMNS = {
     "third_stress": "τ third [%]", "sampling_stress": "τ sampling [%]", "projected_stress": "τ projected [%]",
     "recurrence_stress": "τ recurrence [%]",
 }  # fmt: skip
-_DRAWN = {"third": "a third of the cell", "sampling": "other particles", "projected": "projected run"}
+_TICKS = (0.01, 0.1, 1, 10, 100)
+_DRAWN = {"half": "half the cell", "sampling": "other particles", "projected": "projected run"}
 _DRAWN |= {"recurrence": "recurrence"}
 _CHART = "Distances from the full-order run of the scene, over how far its particles move."
 
@@ -237,6 +238,7 @@ def chart(frame: pd.DataFrame) -> Figure:
         for color, (key, title) in zip(PALETTE, _DRAWN.items(), strict=False):
             panel.plot(100.0 * frame[key], at, "o", color=color, label=title)
         panel.set(xscale="log", xlabel="displacement [%]", yticks=at, ylim=(len(frame) - 0.5, -0.5))
+        panel.set(xlim=(0.01, 100.0), xticks=_TICKS, xticklabels=[f"{tick:g}" for tick in _TICKS])
         panel.set_yticklabels(frame["scene"].str.replace("_", " "))
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(_DRAWN))
         panel.grid(axis="x")
