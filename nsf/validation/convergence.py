@@ -150,7 +150,7 @@ def observed_order(half: float, third: float) -> float:
     def excess(p: float) -> float:
         return (1.0 - 3.0**-p) / (1.0 - 2.0**-p) - third / half
 
-    least, most = 0.1, 4.0
+    least, most = 0.5, 4.0  # a lower order would multiply the distances by more than three
     return float(brentq(excess, least, most)) if excess(least) > 0.0 > excess(most) else np.nan
 
 
