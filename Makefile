@@ -99,7 +99,7 @@ check-reports: install  ## whether reports/ is as it was generated
 	$(BIN)/nsf reports folder=reports check=true
 
 # Every experiment, those of the paper's size first; calibration makes `inverse`.
-REPRODUCED := table1 noise sampling latent_dim training timestep generalise super_resolution forcing trust teaching training_runs large
+REPRODUCED := table1 noise sampling latent_dim training timestep generalise super_resolution forcing trust teaching training_runs taylor2d large
 
 reproduce: install  ## every report, from nothing, on one GPU; the same command goes on where it was stopped
 	@echo 'first the jelly cube at the paper'\''s size, whose rates tell how long the others take at most'
