@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
-    from nsf.recurrence.descent import Runs, Yardstick, fit, standardised
+    from nsf.recurrence.descent import Runs, Yardstick, fit
     from nsf.recurrence.engine import RecurrenceEngine, first_change
     from nsf.recurrence.fitting import Fitting, check_stride
     from nsf.recurrence.form import Form, Sizes, State
     from nsf.recurrence.loop import Loop
+    from nsf.recurrence.scales import standardised
     from nsf.recurrence.solids import collider_states, principal
     from nsf.recurrence.stream import Encoded, Encoder, encoded_trajectory, streamed
     from nsf.recurrence.taught import Taught

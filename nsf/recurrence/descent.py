@@ -11,8 +11,7 @@ from torch import Tensor
 from nsf.errors import InstabilityError
 from nsf.gpu import without_collection
 from nsf.recurrence.fitting import Fitting, check_stride
-from nsf.recurrence.form import Form, Sizes, State
-from nsf.recurrence.solids import principal
+from nsf.recurrence.form import Form, State
 
 _RATE, _LAST_RATE = 2e-3, 1e-5  # of Adam, along a cosine
 _BETAS = (0.9, 0.98)
@@ -118,60 +117,6 @@ class Yardstick:
         return moved.clamp_min(max(1e-3 * float(moved.max()), torch.finfo(moved.dtype).tiny))
 
 
-def standardised(runs: Runs, fitting: Fitting, dt: float, stride: int, programs: bool, seed: int) -> Form:
-    """A recurrence that accelerates nothing yet, with the scales of the runs, in fp64.
-
-    Args:
-        runs: that teach; fitting: widths and members.
-        dt: step of the full-order run [s]; stride: steps of one of the recurrence.
-        programs: whether the runs follow forcing programs.
-        seed: of the weights.
-    """
-    c_mean, c_matrix = principal(list(runs.features.transpose(0, 1).numpy()), programs)
-    sizes = Sizes(
-        latents=runs.xhat.shape[-1], stress=runs.stress.shape[-1], parameters=runs.parameters.shape[1],
-        features=len(c_mean), states=c_matrix.shape[1], gravity=bool(runs.gravity.any()),
-        width=fitting.width, members=fitting.members,
-    )  # fmt: skip
-    form, changes = Form(sizes, dt, stride, seed).double(), runs.changes
-    scales = {
-        "x_mean": runs.xhat.flatten(0, 1).mean(0), "x_scale": _deviation(runs.xhat),
-        "d_scale": _deviation(changes), "a_scale": _deviation(torch.diff(changes, dim=0)),
-        "mu_mean": runs.parameters.mean(0), "mu_scale": _spread(runs.parameters),
-        "s_mean": runs.stress.flatten(0, 1).mean(0), "s_scale": _deviation(runs.stress),
-        "t_scale": _deviation(torch.diff(runs.stress, dim=0)),
-        "c_mean": torch.as_tensor(c_mean), "c_matrix": torch.as_tensor(c_matrix),
-        "g_mean": runs.gravity.flatten(0, 1).mean(0),
-        "g_scale": _gravity_scale(runs.gravity),
-    }  # fmt: skip
-    for name, value in scales.items():
-        getattr(form, name).copy_(value)
-    return form
-
-
-def _deviation(values: Tensor) -> Tensor:
-    """Deviation [k] of [N, R, k]; of what hardly varies a billionth of the largest."""
-    if not values.shape[-1]:
-        return values.new_ones(0)
-    rows = values.flatten(0, -2)
-    deviation = rows.std(0, correction=min(1, len(rows) - 1))
-    return deviation.clamp_min(1e-9 * float(deviation.max().clamp_min(1e-30)))
-
-
-def _spread(values: Tensor) -> Tensor:
-    """Deviation [n] of rows, 1 where there is none but for round-off."""
-    deviation = values.std(0, correction=0)
-    return torch.where(deviation > 1e-9 * values.abs().amax(0), deviation, 1.0)
-
-
-def _gravity_scale(gravity: Tensor) -> Tensor:
-    """Deviation of gravity; its size where it hardly varies."""
-    rows = gravity.flatten(0, -2)
-    spread = (rows - rows.mean(0)).square().mean().sqrt()
-    size = rows.norm(dim=1).max().clamp_min(1e-30)
-    return spread if spread > 1e-3 * size else size
-
-
 def fit(
     form: Form,
     runs: Runs,
@@ -243,6 +188,17 @@ def windows(strides: int, fitting: Fitting) -> list[tuple[int, int]]:
     return list(zip(lengths, steps, strict=True))
 
 
+def ends(states: int, window: int) -> Tensor:
+    """Weights [states] of the states of a run in windows of some strides: the fewer windows reach one, the more.
+
+    The last state of a run is in one of all windows, and bodies of a family have its shape at no other time.
+    The mean over windows is 1; the start of a run, which no window has to reach, has 0.
+    """
+    n = torch.arange(1, states)
+    windows = torch.minimum(torch.minimum(n, states - n), torch.tensor(min(window, states - window))).double()
+    return torch.cat([windows.new_zeros(1), windows.sum() / (len(n) * windows)])
+
+
 class Descent:
     """Steps of Adam on all members together, none of which sees the others.
 
@@ -266,6 +222,7 @@ class Descent:
         self._fitting, self._generator = fitting, torch.Generator().manual_seed(seed)
         self._device, self._taken = torch.device(device), 0
         self._weight, self._single = (here(weights) for weights in _weights(form, sigma))
+        self._ends: dict[int, Tensor] = {}  # weights of the states of runs, by windows
         captured = self._device.type == "cuda"
         rate = torch.tensor(_RATE, device=device) if captured else _RATE
         self._adam = torch.optim.Adam(self._form.parameters(), lr=rate, betas=_BETAS, capturable=captured)
@@ -330,10 +287,19 @@ class Descent:
             offs.append(off)
         errors = (self._weight * torch.stack(offs).square()).sum(-1)
         growth = _GROWTH / torch.arange(1.0, window + 1, device=n.device)
-        loss = torch.log1p(growth[:, None, None] * errors).mean((0, 2))
+        each = torch.log1p(growth[:, None, None] * errors)
+        loss = (self._weights_of(window)[steps[1:]] * each).mean((0, 2))
         apart = form.advance(truth[0], seen[0], terms[0], ratios) - truth[1]
         single = (self._single * apart.square()).sum(-1).mean(1)
         return (loss + _SINGLE * single).sum()
+
+    def _weights_of(self, window: int) -> Tensor:
+        """[N + 1] of the states of a run in windows; those of a GPU are made before a graph is captured."""
+        if window not in self._ends:
+            states = len(self._states)
+            weights = ends(states, window) if self._fitting.ends else torch.ones(states)
+            self._ends[window] = weights.to(self._states)
+        return self._ends[window]
 
     def _captured(self, window: int) -> Callable[..., None]:
         """A step of the descent as a CUDA graph."""

@@ -15,6 +15,7 @@ class Fitting:
         members: fitted side by side, whose runs are averaged.
         descents: steps of the descent.
         window: strides of the longest windows; None: half a run.
+        ends: whether the last states of runs, which few windows reach, count as much as all others.
         batch: windows of each, a member.
         noise: on x̂ and ŝ at the start of a window [deviations].
 
@@ -28,6 +29,7 @@ class Fitting:
     batch: int = 128
     noise: float = 0.01
     window: int | None = None
+    ends: bool = False
 
     def __post_init__(self):
         for name in ("width", "members", "descents", "batch", "window"):

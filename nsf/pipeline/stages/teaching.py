@@ -17,7 +17,8 @@ from nsf.models.lookup import training_lessons
 from nsf.pipeline.stages.encoding import encoded_runs, encoded_validation
 from nsf.progress import Progress
 from nsf.recurrence import taught as files
-from nsf.recurrence.descent import Runs, Yardstick, fit, standardised
+from nsf.recurrence.descent import Runs, Yardstick, fit
+from nsf.recurrence.scales import standardised
 from nsf.recurrence.taught import Taught
 from nsf.runs import Record, Run
 from nsf.scenes.identity import physics_hash

@@ -9,7 +9,7 @@ import torch
 
 from nsf.errors import ConfigError, InstabilityError
 from nsf.recurrence import Fitting, Runs, Yardstick, fit, standardised
-from nsf.recurrence.descent import Descent, windows
+from nsf.recurrence.descent import Descent, ends, windows
 from nsf.recurrence.fitting import check_stride
 from nsf.recurrence.form import State
 
@@ -175,6 +175,29 @@ def test_the_loss_of_a_window_is_that_of_the_form_in_units():
     torch.testing.assert_close(
         descent._loss(window, k, n, *noise).double(), (expected + 0.3 * single).sum(), rtol=1e-4, atol=0.0
     )
+
+
+@pytest.mark.parametrize("window", [1, 3, 10, 39])
+def test_every_state_of_a_run_counts_alike(window):
+    states = 41
+    reached = np.zeros(states)
+    for first in range(states - window):
+        reached[first + 1 : first + window + 1] += 1.0
+    counts = reached * ends(states, window).numpy()
+    np.testing.assert_allclose(counts[1:], window * (states - window) / (states - 1), rtol=1e-6)
+
+
+def test_the_end_of_runs_is_followed_as_well_as_their_midst():
+    """Of a family, whose last states are in few windows; the members of one seed begin alike."""
+    runs, last = damped(), []
+    for fitting in (replace(SHORT, descents=60, ends=ends_count) for ends_count in (False, True)):
+        form = standardised(runs, fitting, 0.01, 1, False, 0)
+        fit(form, runs, yardstick(runs), torch.ones(2), fitting, 0)
+        start = form.begin(runs.xhat[0], runs.first, runs.stress[0])
+        with torch.no_grad():
+            xhat, _ = form.run(start, runs.parameters, runs.gravity, form.collider_state(runs.features))
+        last.append(float((xhat[-1].mean(0) - runs.xhat[-1]).square().mean()))
+    assert last[1] < last[0]
 
 
 def test_a_parameter_that_never_varies_has_no_scale():
