@@ -239,17 +239,17 @@ class Trust:
         """Why the inputs of a run, in its steps from one on, are outside of what was taught; empty if not."""
         if self.reach is None:
             return ""
-        version, known = self._forced.get(run.together, (None, None))
+        version, acting, reasons = self._forced.get(run.together, (None, {}, {}))
         if version != run.together.batch.forcing.version:  # until a hand acts
-            version, known = run.together.batch.forcing.version, {}
-            self._forced[run.together] = version, known
+            version, acting, reasons = run.together.batch.forcing.version, {}, {}
+            self._forced[run.together] = version, acting, reasons
+        if run.index not in acting:
+            acting[run.index] = self._acting(run)
         part = run.index, first, run.steps_taken
-        if run.index not in known:
-            known[run.index] = self._acting(run)
-        if part not in known:
-            acting = (values[first - 1 : run.steps_taken] for values in known[run.index])
-            known[part] = self.reach.of_inputs(run.setup.values, *acting, run.dt)
-        return known[part]
+        if part not in reasons:
+            inputs = (values[first - 1 : run.steps_taken] for values in acting[run.index])
+            reasons[part] = self.reach.of_inputs(run.setup.values, *inputs, run.dt)
+        return reasons[part]
 
     @staticmethod
     def _acting(run: ReducedMPM) -> tuple[np.ndarray, np.ndarray]:

@@ -275,13 +275,13 @@ class _Pictures:
         """Keep what is shown of the frames of a block [F, P, 3] [m] and [F, P, 6] [Pa]."""
         inside = [n - block.start for n in self._frames if block.start <= n < block.stop]
         roles = [_roles(self._setup, x_rom[n], self._samples[block.start + n])[self._shown] for n in inside]
-        stress_full, stress_reduced = (metrics.von_mises(of[inside][:, self._shown]) for of in (tau, tau_rom))
-        kept = {
-            "x_full": x[inside][:, self._shown], "x_reduced": x_rom[inside][:, self._shown],
-            "stress_full": stress_full, "stress_reduced": stress_reduced,
-        }  # fmt: skip
-        # Of a body that is turned inside out a law may have no stress: it is shown as 0.
-        arrays = {name: torch.nan_to_num(values.float()).cpu().numpy() for name, values in kept.items()}
+        fields = {"x_full": x, "x_reduced": x_rom, "stress_full": tau, "stress_reduced": tau_rom}
+        arrays = {}
+        for name, values in fields.items():
+            shown = values[inside][:, self._shown]
+            if name.startswith("stress"):  # 0 where a law has none, as of a body turned inside out
+                shown = torch.nan_to_num(metrics.von_mises(shown).float())
+            arrays[name] = shown.float().cpu().numpy()
         arrays["role"] = np.array(roles, np.int8).reshape(len(inside), len(self._shown))
         for name, values in arrays.items():
             self._kept.setdefault(name, []).append(values)

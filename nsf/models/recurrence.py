@@ -41,9 +41,7 @@ class Recurrence(Drawn):
     def fitting_of(self, forced: bool) -> Fitting:
         """How it is fitted where programs force a scene, or do not."""
         batch = self.batch if self.batch is not None else BATCH[forced]
-        return Fitting(
-            self.width, self.members, self.descents, batch, window=self.window, ends=not forced
-        )
+        return Fitting(self.width, self.members, self.descents, batch, window=self.window, ends=not forced)
 
     @override
     def stress_of(self, forced: bool) -> int:

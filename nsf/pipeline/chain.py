@@ -50,7 +50,7 @@ class Pipeline(Configured):
 
     Raises:
         ConfigError: a value is missing or refused; names it. What only a stage's work needs is built, and
-            refused, by `check`, which every stage begins with.
+            refused, by `check`: before the work of a stage, and of `simulate` while its first runs go on.
         DeviceError: the device does not exist.
     """
 

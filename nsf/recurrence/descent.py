@@ -189,7 +189,7 @@ def windows(strides: int, fitting: Fitting) -> list[tuple[int, int]]:
 
 
 def ends(states: int, window: int) -> Tensor:
-    """Weights [states] of the states of a run in windows of some strides: the fewer windows reach one, the more.
+    """Weights [states] of a run in windows of some strides: the fewer of them reach a state, the more.
 
     The last state of a run is in one of all windows, and bodies of a family have its shape at no other time.
     The mean over windows is 1; the start of a run, which no window has to reach, has 0.

@@ -28,7 +28,7 @@ LAW = {"_target_": "mine.laws.Stiff", "E": 1e3, "nu": 0.3}
 def forget() -> None:
     for cached in (installed.entry_points, installed.root_of, code._sum_of, code._home, code._imported):
         cached.cache_clear()
-    for cached in (code._tree, code._arguments, code.text_of):
+    for cached in (code.tree_of, code._arguments, code.text_of):
         cached.cache_clear()
     for name in [name for name in sys.modules if name.partition(".")[0] in ("mine", "broken")]:
         del sys.modules[name]

@@ -36,7 +36,8 @@ def test_what_a_terminal_cannot_show_is_replaced(terminal, encoding, words, tmp_
     with pytest.raises(SystemExit) as end:
         main(words)
     assert end.value.code in (0, None)
-    assert shown.getvalue().decode(encoding)
+    sys.stderr.flush()
+    assert (shown.getvalue() + sys.stderr.buffer.getvalue()).decode(encoding)
 
 
 def test_a_name_that_is_no_text_can_be_printed(terminal):

@@ -75,9 +75,10 @@ class Arena:
         if self.device.is_cuda:
             modes, lengths = self.halved(table, rows) if half else (self.modes(table, rows), none)
             return {"modes": modes, "lengths": lengths, "rows": self.zeros(1, dtype=torch.int32)}
-        self.mode_bytes += len(rows) * table[0].nbytes
-        self._tables.append(table.to(self._torch, torch.float32).contiguous())
-        return {"modes": self._tables[-1].flatten(), "lengths": none, "rows": self.hold(rows, torch.int32)}
+        stored = table.to(self._torch, torch.float32).contiguous()
+        self.mode_bytes += len(rows) * stored[0].nbytes
+        (self._tables if stored.data_ptr() == table.data_ptr() else self._buffers).append(stored)
+        return {"modes": stored.flatten(), "lengths": none, "rows": self.hold(rows, torch.int32)}
 
     def modes(
         self,

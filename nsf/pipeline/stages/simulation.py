@@ -59,7 +59,7 @@ def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str]
         if line not in warned:
             pipeline.say(f"simulate: warning: {line}")
     started = time.perf_counter()
-    made = make(pipeline, runs, warnings, begun, pipeline.check)
+    made = make(pipeline, runs, warnings, begun, pipeline.check if begun else lambda: None)
     elsewhere = f", {len(runs) - made} by another process" if made < len(runs) else ""
     pipeline.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
     odd = [line for run in runs for line in run.manifest.get("warnings", ()) if line in (STILL, RIGID, FLAT)]
