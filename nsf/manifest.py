@@ -25,6 +25,9 @@ MANIFEST = "manifest.json"
 CONFIG = "config.yaml"
 #: A folder's name that a stage, a scene or a hash may be.
 NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
+#: Stages of `nsf run` that leave runs, in order, and all that do.
+CHAIN = ("simulate", "train", "encode", "teach", "deploy", "evaluate")
+STAGES = (*CHAIN, "superresolve")
 STATUSES = ("running", "complete", "failed", "interrupted")
 
 _RUN = re.compile(rf"{NAME.pattern}/{NAME.pattern}/{NAME.pattern}", re.ASCII)

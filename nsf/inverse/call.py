@@ -17,7 +17,7 @@ import pandas as pd
 from nsf import schemas, words
 from nsf.data import PROGRAM, Trajectory
 from nsf.errors import ConfigError, MissingRunError
-from nsf.inverse.columns import check_scalars, read_columns
+from nsf.inverse.columns import SAME_TIME, check_scalars, read_columns
 from nsf.paths import reports_folder
 from nsf.results.folder import check_place
 from nsf.runs import Run
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 _RANGE = re.compile(rf"({words.NUMBER})\.\.({words.NUMBER})")
 _MOST_TRIALS = 10_000
-_LONGEST_STEP = 4.0  # of a deployment, in Δt; longer ones are refused by the model
 _CASES = {"cases": [[{...: float}]]}  # of a teach run: training, drawn and validation cases
 _SCENE = {"scene": {"dt": float, "steps": int}, "parameters": {...: dict}}  # of a deploy run
 
@@ -184,8 +183,7 @@ class Call:
         if (path := self.values.get(key)) is None:
             return None
         columns, scene = read_columns(path), self.run.config["scene"]
-        # The last step of a deployment may end after the run.
-        run = (0.0, scene["dt"] * scene["steps"], scene["dt"] * _LONGEST_STEP)
+        run = (0.0, scene["dt"] * scene["steps"], scene["dt"] * SAME_TIME)
         for name, (low, high, slack) in {"t": run, **_box(self.run)}.items():
             values = columns.get(name, np.zeros(0))
             outside = np.flatnonzero((values < low - slack) | (values > high + slack))

@@ -24,6 +24,8 @@ from nsf.words import NUMBER
 AXES = ("x", "y", "z")
 _COMPONENT = re.compile(rf"([xyz])@({NUMBER}):({NUMBER}):({NUMBER})")
 COLUMNS = ("t", "particle", "X", "Y", "Z", "x", "y", "z", "quantity", "value", "deviation")
+#: Of Δt: how far a time may be outside of a run.
+SAME_TIME = 1e-6
 _MOST_ROWS = 1_000_000
 _MOST_BYTES = 2**28  # of a file, and of the text that is packed in it
 _HEAD = 4096  # letters of the line of names

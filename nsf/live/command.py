@@ -26,7 +26,15 @@ class Parser(argparse.ArgumentParser):
 
     def parse_args(self, arguments: Sequence[str]) -> argparse.Namespace:
         """The options; a `key=value` is that of the option `--key`, and `run=` the run."""
-        return super().parse_args([dashed for word in arguments for dashed in self._dashed(word)])
+        words: list[str] = []
+        for before, word in zip(("", *arguments), arguments, strict=False):
+            words += [word] if self._takes_value(before) else self._dashed(word)
+        return super().parse_args(words)
+
+    def _takes_value(self, word: str) -> bool:
+        """Whether a word is an option, or the beginning of one, after which its value stands."""
+        options = self._option_string_actions.items()
+        return len(word) > 2 and any(name.startswith(word) and one.nargs != 0 for name, one in options)
 
     def _dashed(self, word: str) -> list[str]:
         key, equals, value = word.partition("=")
@@ -35,7 +43,8 @@ class Parser(argparse.ArgumentParser):
         if key == "run":
             return [value]
         if (option := self._option_string_actions.get(f"--{key}")) is None:
-            self.error(f"no key {key!r}")
+            keys = [name[2:] for name in self._option_string_actions if name.startswith("--")]
+            self.error(f"no key {key!r}; it takes run, {', '.join(keys[1:])}")  # the first one is help
         return [f"--{word}"] if option.nargs != 0 else [f"--{key}"] * flag(key, value)
 
     def error(self, message: str):

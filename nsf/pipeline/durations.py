@@ -22,7 +22,6 @@ from nsf.runs import Run
 from nsf.scenes.checks import host_bytes
 
 FILE = "times.csv"
-STAGES = ("simulate", "train", "encode", "teach", "deploy", "evaluate", "report")
 #: [s] of a command beside its stages: Python and libraries begin.
 START = 6.0
 

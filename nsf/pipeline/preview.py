@@ -12,8 +12,9 @@ from rich.table import Table
 
 from nsf import config as configuration
 from nsf.data.case import PROGRAM, Case, with_unit
+from nsf.manifest import CHAIN
 from nsf.pipeline.chain import Pipeline
-from nsf.pipeline.durations import STAGES, START, Interval, crowding, due, interval, times, work_of
+from nsf.pipeline.durations import START, Interval, crowding, due, interval, times, work_of
 from nsf.runs import Run
 from nsf.storage import bytes_text
 
@@ -105,7 +106,7 @@ def _row(stage: Stage, guessed: bool) -> list[str]:
 def stages_of(pipelines: Sequence[Pipeline]) -> list[Stage]:
     """The stages that some jobs have, in order."""
     done, stages = times(pipelines[0].training.root), []
-    for name in STAGES:
+    for name in (*CHAIN, "report"):
         runs = [] if name == "report" else [run for one in pipelines for run in one.runs_of(name)]
         runs = tuple(dict.fromkeys(runs))
         if not runs and name != "report":

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 
 from nsf.errors import first_line
 from nsf.extras import optional
+from nsf.manifest import CHAIN
 from nsf.runs import Run
 from nsf.runs.listing import flat
 from nsf.storage import locked
@@ -161,7 +162,7 @@ def figures(pipeline) -> dict[str, float]:
     """Figures of the evaluate run, and the seconds of each stage, as far as they are there."""
     seconds = {
         f"seconds/{stage}": sum(run.manifest["seconds"] for run in runs)
-        for stage in ("simulate", "train", "encode", "teach", "deploy", "evaluate")
+        for stage in CHAIN
         if (runs := pipeline.runs_of(stage)) and all(run.complete for run in runs)
     }
     metrics = pipeline.evaluation.manifest["metrics"] if pipeline.evaluation.complete else {}

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from nsf.errors import ConfigError
-from nsf.manifest import STATUSES
+from nsf.manifest import STAGES, STATUSES
 from nsf.paths import groups, option
 from nsf.runs.run import Run
 
@@ -29,7 +29,6 @@ ABSENT = "–"
 #: Groups whose option a run's settings tell, by the class that they name.
 _GROUPS = ("field", "trainer", "sampler", "projector", "integration")
 _GENERATIONS = 32  # of runs, each made from the one before; a chain has five
-_STAGES = ("simulate", "train", "encode", "teach", "deploy", "evaluate", "superresolve")
 _MOST = 8  # values that a sentence names
 ORIGIN = ("commit", "dirty", "device", "seed", "precision", "versions")
 
@@ -104,18 +103,30 @@ def entries(
         ConfigError: there are runs, and none has such a key; or no run can have such a value of a field or a
             group. Names those that there are.
     """
+    return chosen(listed(root), filters or {}, sort)
+
+
+def listed(root: Path | None = None) -> list[Entry]:
+    """Every run, the newest first."""
     cache: dict[Run, dict[str, Any]] = {}
-    chosen = [Entry(run, cache) for run in Run.find(root=root)]
+    return [Entry(run, cache) for run in Run.find(root=root)]
+
+
+def chosen(every: Sequence[Entry], filters: Mapping[str, str], sort: str) -> list[Entry]:
+    """Those of the listed runs that pass every filter, sorted, as `entries` says."""
     key = sort.removeprefix("-")
-    for name, wanted in (filters or {}).items():
-        _check_value(name, wanted, chosen)
-    for name in (*(filters or ()), key):
-        _check_key(name, chosen)
-    for name, wanted in (filters or {}).items():
-        chosen = [entry for entry in chosen if _matches(value_of(entry, name), wanted)]
-    valued = [entry for entry in chosen if value_of(entry, key) is not None]
+    for name, wanted in filters.items():
+        _check_value(name, wanted, every)
+    for name in (*filters, key):
+        _check_key(name, every)
+    matching = [
+        entry
+        for entry in every
+        if all(_matches(value_of(entry, name), wanted) for name, wanted in filters.items())
+    ]
+    valued = [entry for entry in matching if value_of(entry, key) is not None]
     valued.sort(key=lambda entry: _order(value_of(entry, key)), reverse=sort.startswith("-"))
-    return valued + [entry for entry in chosen if value_of(entry, key) is None]
+    return valued + [entry for entry in matching if value_of(entry, key) is None]
 
 
 def _settings(run: Run, cache: dict[Run, dict[str, Any]], generations: int) -> dict[str, Any]:
@@ -174,12 +185,12 @@ def _check_key(key: str, listed: Sequence[Entry]) -> None:
 
 def _check_value(key: str, wanted: str, listed: Sequence[Entry]) -> None:
     """Refuse a value that no run can have, of keys whose values are known."""
-    fields = {"stage": _STAGES, "status": (*STATUSES, "killed", "incomplete", "broken", "missing")}
+    fields = {"stage": STAGES, "status": (*STATUSES, "killed", "incomplete", "broken", "missing")}
     if (values := fields.get(key) or groups().get(key)) is None:
         return
     values = list(dict.fromkeys([*values, *_values(key, listed)]))
     for pattern in wanted.split(","):
-        if not any(fnmatchcase(value, pattern) for value in values):
+        if not any(fnmatchcase(value, pattern) for value in (*values, ABSENT)):
             raise ConfigError(f"no run can have {key}={pattern}; choose {', '.join(values)}")
 
 
@@ -190,16 +201,17 @@ def _values(key: str, listed: Sequence[Entry]) -> list[str]:
     return list(dict.fromkeys(text(one) for one in each if one is not None))
 
 
-def why_none(filters: Mapping[str, str], root: Path | None = None) -> str:
-    """A sentence on filters that no run passes: there is none at all, or which filter leaves none."""
-    if not (every := entries(root=root)):
+def why_none(filters: Mapping[str, str], every: Sequence[Entry]) -> str:
+    """A sentence on filters that none of the runs passes: there is no run, or which filter leaves none."""
+    if not every:
         return "no runs yet; `nsf run scene=sand` makes some, and NSF_RUNS names another folder"
     none = f"none of {len(every)} runs has"
     for key, wanted in filters.items():
         if not any(_matches(value_of(entry, key), wanted) for entry in every):
             values = _values(key, every)
             more = f" and {len(values) - _MOST} more" if len(values) > _MOST else ""
-            return f"{none} {key}={wanted}; they have {', '.join(values[:_MOST])}{more}"
+            others = f"; they have {', '.join(values[:_MOST])}{more}" if values else ""
+            return f"{none} {key}={wanted}{others}"
     return f"{none} all of {' '.join(f'{key}={wanted}' for key, wanted in filters.items())}"
 
 

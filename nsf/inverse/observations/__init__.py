@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nsf.data import Trajectory
 from nsf.errors import ConfigError
-from nsf.inverse.columns import AXES, COLUMNS, component, read_columns
+from nsf.inverse.columns import AXES, COLUMNS, SAME_TIME, component, read_columns
 from nsf.inverse.model import Model
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Restriction
@@ -23,8 +23,6 @@ _Positions = Callable[[np.ndarray], Tensor]
 _POINT = ("X", "Y", "Z")
 #: Particles that a scalar of a shape is taken from.
 BODY = 1000
-#: Of Δt: how far a time may be outside of a run.
-_SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class Observations:
             ConfigError: a time is outside of the run, a point outside of the body, a deviation not positive,
                 or a value not finite.
         """
-        end, slack = float(model.t[-1]), _SAME_TIME * model.dt
+        end, slack = float(model.t[-1]), SAME_TIME * model.dt
         t, deviation, value = self.t, self.deviations, self.values
         outside, positive = (t < -slack) | (t > end + slack), np.isfinite(deviation) & (deviation > 0.0)
         self._refuse(
@@ -247,7 +245,7 @@ class View:
 def _between(t: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
     """The frame before each time, and the share of the step that has passed since."""
     at = np.clip(t / model.dt, 0.0, len(model.t) - 1.0)
-    at = np.where(np.abs(at - np.round(at)) < _SAME_TIME, np.round(at), at)
+    at = np.where(np.abs(at - np.round(at)) < SAME_TIME, np.round(at), at)
     steps = np.floor(at).astype(int)
     return steps, at - steps
 

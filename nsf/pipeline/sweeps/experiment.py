@@ -61,8 +61,9 @@ class Experiment:
         printed: δ that the paper prints of single jobs, as `Question` has them; None where it prints one a
             scene and method, which the scene's file has.
         placed: whether the command line says where the report goes.
-        changes: overrides of the command line by which the jobs differ from the file's, in order; the name
-            and the title of the report have them, so that it never replaces one of the file's jobs.
+        changes: overrides of the command line that not every grid states so, in order, also one that restates
+            a default; the name and the title of the report have them, so that it never replaces one of the
+            file's jobs.
         parts: experiments with questions, jobs and reports of their own; none where the file has jobs itself.
     """
 

@@ -9,7 +9,7 @@ from nsf import words
 from nsf.errors import ConfigError, StorageError
 from nsf.runs import Run
 from nsf.runs.columns import table
-from nsf.runs.listing import FIELDS, Entry, entries, text, why_none
+from nsf.runs.listing import FIELDS, Entry, chosen, listed, text, why_none
 from nsf.runs.pruning import dependents, older, prunable, remove
 from nsf.storage import bytes_text, size_of
 from nsf.terminal import screen
@@ -80,7 +80,8 @@ def main(arguments: Sequence[str]) -> int:
     formats = [word for word in arguments if word in ("--json", "--csv")]
     filters = words.pairs("runs", [word for word in arguments if word not in formats])
     sort = filters.pop("sort", "")
-    runs = _matching(filters, sort or "-created")
+    every = listed()
+    runs = _matching(every, filters, sort or "-created")
     named = [*filters, *([sort.removeprefix("-")] if sort else [])]
     if formats:
         print(_written(table(runs, named), formats[-1]), end="")
@@ -91,7 +92,7 @@ def main(arguments: Sequence[str]) -> int:
         page.print(runs_table(runs, named, page.width))
     _say(f"broken: {entry.run.path}: {entry.fault}" for entry in runs if entry.fault)
     more = "" if arguments else ", of which `nsf runs --help` says more"
-    _say([f"{len(runs)} runs{more}" if runs else why_none(filters)])
+    _say([f"{len(runs)} runs{more}" if runs else why_none(filters, every)])
     return 0
 
 
@@ -106,10 +107,10 @@ def _written(frame: "pd.DataFrame", form: str) -> str:
     return json.dumps(rows, indent=1, ensure_ascii=False, default=str) + "\n"
 
 
-def _matching(filters: dict[str, str], sort: str = "-created") -> list[Entry]:
-    """The runs that pass all filters; a key that was removed is refused by naming its replacement."""
+def _matching(every: Sequence[Entry], filters: dict[str, str], sort: str = "-created") -> list[Entry]:
+    """Those that pass all filters; a key that was removed is refused by naming its replacement."""
     try:
-        return entries(filters, sort)
+        return chosen(every, filters, sort)
     except ConfigError:
         from nsf.config.removed import refuse_overrides  # with all of Hydra, for a mistake alone
 
@@ -140,7 +141,7 @@ def _diff(ids: Sequence[str]) -> int:
 
 
 def _verify(arguments: Sequence[str]) -> int:
-    runs = _matching(words.pairs("runs verify", arguments))
+    runs = _matching(listed(), words.pairs("runs verify", arguments))
     faults = [fault for entry in runs for fault in entry.run.verify()]
     _say(faults)
     _say([f"{len(runs)} runs, {len(faults)} faults"])
@@ -165,7 +166,7 @@ def _prune(arguments: Sequence[str]) -> int:
     filters = words.pairs("runs prune", arguments)
     sure, results = (words.flag(key, filters.pop(key, "false")) for key in ("yes", "results"))
     age = filters.pop("older", None)
-    runs = _matching(filters)
+    runs = _matching(listed(), filters)
     if age is not None:
         runs = older(runs, age)
     return _delete(prunable(runs, Run.find(), results), sure)

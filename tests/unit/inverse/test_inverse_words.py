@@ -20,6 +20,7 @@ FIRST = "t,particle,x,deviation\n0.1,5,0.5,0.001\n"
         (calibrate, [SEEN, "program=1"], FIRST, "has no programs"),
         (calibrate, [SEEN, "trials=-1"], FIRST, "trials=-1 must be a whole number"),
         (calibrate, [SEEN], FIRST.replace("0.1,", "99,"), "row 1: t=99 is outside of the run, 0 …"),
+        (calibrate, [SEEN], FIRST.replace("0.1,", "0.121,"), "row 1: t=0.121 is outside of the run, 0 …"),
         (calibrate, [SEEN], "t,X,Y,Z,x,deviation\n0.1,3,0,0,3,0.1\n", "X=3 is outside of the body at rest"),
         (sample, ["runs=-5"], FIRST, "runs=-5 must be a whole number"),
         (sample, ["of=hight"], FIRST, "of=hight is none of height"),

@@ -13,8 +13,10 @@ import pytest
 from test_player import wait_until
 
 from nsf.cli import main
+from nsf.live.command import _parser
 
 LIVE = ("view", "serve")
+PADDED = "c2VjcmV0c2VjcmV0=="  # base64
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ REFUSED = [
     (("view", "--port", "abc"), "--port=abc must be a whole number from 0 to 65535"),
     (("view", "--points", "0"), "--points=0 must be a whole number from 1"),
     (("view", "--frames", "30"), "unrecognized arguments"),
-    (("view", "latent_dim=4"), "no key 'latent_dim'"),
+    (("view", "latent_dim=4"), "no key 'latent_dim'; it takes run, host, port, points"),
     (("view", "port=65536"), "--port=65536 must be a whole number from 0 to 65535"),
     (("view", "run=train/sand"), "no deploy run is, or begins with, 'train/sand'"),
     (("view", "train/sand"), "no deploy run is, or begins with, 'train/sand'"),
@@ -62,6 +64,12 @@ def test_bad_input_is_told(nsf, arguments, quoted):
     assert quoted in err
     assert err.startswith("error: ")
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("words", [("--token", PADDED), ("--tok", PADDED), (f"token={PADDED}",)])
+def test_a_padded_token_is_no_key(words):
+    options = _parser("serve", "").parse_args([*words, "rate=10", "--host", "run=x", "run=1a2b"])
+    assert (options.token, options.rate, options.host, options.run) == (PADDED, 10.0, "run=x", "1a2b")
 
 
 @pytest.mark.parametrize("command", LIVE)

@@ -11,7 +11,7 @@ from nsf.cli import main
 from nsf.errors import ConfigError
 from nsf.results.overview.tables import difference_table
 from nsf.runs import Run
-from nsf.runs.listing import entries
+from nsf.runs.listing import entries, listed, why_none
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +73,7 @@ def test_all_newest_first(root):
         ({"parameters.E.value": "3"}, 1),
         ({"parameters.mu.value": "2", "stage": "train"}, 3),  # of one of the data that it was made from
         ({"stage": "deploy"}, 0),
+        ({"metric": "–", "stage": "evaluate,train"}, 1),  # as tables show a value that a run lacks
     ],
 )
 def test_filters(root, filters, count):
@@ -119,6 +120,30 @@ def test_a_filter_that_no_run_passes(root, monkeypatch, capsys, words, code, quo
     printed = capsys.readouterr()
     assert quoted in printed.err
     assert not printed.out or "--csv" in words
+
+
+def test_runs_without_an_option(tmp_path):
+    made(tmp_path, "deploy", {"model": {"name": "recurrence"}})
+    without = made(tmp_path, "train", {})
+    assert [entry.run for entry in entries({"model": "–"}, root=tmp_path)] == [without]
+    assert len(entries({"model": "–,recurrence"}, root=tmp_path)) == 2
+    assert why_none({"scene": "–"}, listed(tmp_path)) == "none of 2 runs has scene=–; they have sand"
+
+
+def test_a_field_that_no_run_has_ends_the_sentence(tmp_path):
+    made(tmp_path, "simulate", {})
+    assert why_none({"metric": "0.5"}, listed(tmp_path)) == "none of 1 runs has metric=0.5"
+
+
+def test_why_none_reads_no_run_again(root, monkeypatch, capsys):
+    monkeypatch.setenv("NSF_RUNS", str(root))
+    looks = []
+    find = Run.find
+    monkeypatch.setattr(Run, "find", lambda *a, **k: looks.append(a) or find(*a, **k))
+    with pytest.raises(SystemExit):
+        main(["runs", "latent_dim=7"])
+    assert len(looks) == 1
+    assert "none of 8 runs" in capsys.readouterr().err
 
 
 def test_no_runs_yet(tmp_path, monkeypatch, capsys):
