@@ -70,9 +70,9 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
 
 def _check_validated(words: list[str]) -> None:
     """Whether there are the problems and scenes that `nsf validate` runs; tests/validation runs them."""
-    given = dict(word.split("=", 1) for word in words)
-    known = {"problems": PROBLEMS, "scenes": groups()["scene"]}
-    assert all(set(values.split(",")) <= set(known[key]) for key, values in given.items())
+    words_of = {key: values.split(",") for key, values in (word.split("=", 1) for word in words)}
+    choices = {"problems": PROBLEMS, "scenes": groups()["scene"]}
+    assert all(set(values) <= set(choices[key]) for key, values in words_of.items())
 
 
 def _quick(words: list[str]) -> list[str]:
