@@ -110,6 +110,7 @@ reproduce: install  ## every report, from nothing, on one GPU; the same command 
 	NSF_RUNS=$${NSF_RUNS:-runs}-calibration $(MAKE) calibration
 	$(BIN)/nsf bench
 	$(BIN)/nsf validate
+	$(BIN)/nsf reports folder=reports
 	$(BIN)/nsf validate scenes=bread,cake,sand,metal,toothpaste,jelly_cube,squishy_ball
 	$(BIN)/nsf reports folder=reports
 	$(BIN)/nsf reports folder=reports check=true

@@ -230,15 +230,21 @@ class Scene:
             multiple: of Δt; it divides the steps.
 
         Raises:
-            ConfigError: a body, a collider or the walls do not fit the coarse grid.
+            ConfigError: a body, a collider or the walls do not fit the coarse grid, or the steps are no
+                whole number of larger ones.
         """
+        steps = self.steps / multiple
+        if not math.isclose(steps, round(steps), rel_tol=1e-9):
+            raise ConfigError(
+                f"multiple={multiple:g} does not divide scene.steps={self.steps}; set one that does"
+            )
         counts = [max(1, round(body.particles / factor**3)) for body in self.bodies.values()]
         return replace(
             self,
             bodies=self._recounted(counts),
             dx=factor * self.dx,
             dt=multiple * self.dt,
-            steps=round(self.steps / multiple),
+            steps=round(steps),
         )
 
     def _recounted(self, counts: Sequence[float]) -> dict[str, Body]:

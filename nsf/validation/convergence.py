@@ -31,11 +31,12 @@ from nsf.scenes import Scene, Shape
 #: In the order of the paper's Table 1.
 SCENES = ("bread", "cake", "sand", "metal", "toothpaste", "jelly_cube", "squishy_ball")
 FILE = "convergence.csv"
-_TEXTS = ("scene", "case", "device", "commit")
-_FRAMES = 5  # evenly spread over the run, the last one included
+_TEXTS = ("scene", "scale", "case", "device", "commit")
+_FRAMES = 5  # spread over the run, the last one included
 _FINER = {"half": 2, "third": 3}
 _MOST = 7e7  # particles times steps of a finer run, two minutes on a core; longer ones are left out on a CPU
-_REDUCED = "table1/small"  # the report with the reduced runs of the same cases
+_REDUCED = "table1/small"  # the report with the reduced runs of the same cases, at this scale:
+_SCALE = "small"
 _LEAD = (
     "How far is the grid of each scene from finer ones, and how far are reduced runs from the grid's own run?"
 )
@@ -43,10 +44,11 @@ _NOTE = (
     "All distances are from the run of the scene, over how far its particles move, or over its stress. "
     "half, third: that of the cell and of the time step, with as many particles a cell; – where it takes "
     "over 7e7 steps of a particle, on a CPU. order p: from these two, as the error of a grid is taken to "
-    "be C hᵖ. grid: the error of the scene's grid by this order; – where the two tell none: where they go "
-    "on growing it is more than `third`. sampling: other particles on the same grid, carried to those of "
-    "the scene; a smaller error tells of these particles, not of the body. projected, recurrence: means "
-    "over the test cases and seeds of `table1/small`."
+    "be C hᵖ. grid: the error of the scene's grid by this order. Both are – where half and third differ by "
+    "less than `sampling`, and where they tell no order: where they go on growing the error is more than "
+    "`third`. sampling: other particles on the same grid, carried to those of the scene; a smaller error "
+    "tells of these particles, not of the body. projected, recurrence: means over the test cases and seeds "
+    "of `table1/small`, of scenes at small scale."
 )
 _COLUMNS = {
     "half": "half [%]", "third": "third [%]", "grid": "grid [%]", "sampling": "sampling [%]",
@@ -122,13 +124,15 @@ class Frames:
 
 def run(scene: Scene, device: str, like: Scene | None = None) -> Frames:
     """The frames of a full-order run, at the particles that it shares with the run of a scene it refines."""
+    like = like or scene
     solver, frames = scene.full_order(device=device), []
     counts = [body.particles for body in scene.bodies.values()]
-    shared = [body.particles for body in (like or scene).bodies.values()]
+    shared = [body.particles for body in like.bodies.values()]
     starts = np.cumsum([0, *counts[:-1]])
     rows = np.concatenate([start + np.arange(n) for start, n in zip(starts, shared, strict=True)])
-    for _ in range(_FRAMES):
-        solver.step(scene.steps // _FRAMES)
+    stops = like.steps * np.arange(1, _FRAMES + 1) // _FRAMES * (scene.steps // like.steps)
+    for stop in stops:
+        solver.step(int(stop) - solver.steps_taken)
         state = solver.state.numpy()
         frames.append((state["x"][rows], state["tau"][rows].reshape(-1, 9)))
     x, tau = (np.stack(of).astype(float) for of in zip(*frames, strict=True))
@@ -158,7 +162,8 @@ def converge(folder: str | Path, options: Mapping[str, str], say: Callable[[str]
     """Run scenes on finer grids, and write the report of these and of those that the folder has already.
 
     Args:
-        folder: of the report; rows of other scenes stay.
+        folder: of the report; rows of other scenes and scales stay. Errors of reduced runs are read from the
+            table of all reports, in the folder that holds it.
         options: `scenes`, `scale` and `device`, as on the command line.
         say: called with a line on each scene.
 
@@ -170,17 +175,18 @@ def converge(folder: str | Path, options: Mapping[str, str], say: Callable[[str]
         DeviceError: the device does not exist.
     """
     folder = Path(folder)
-    names = [one_of("scenes", name, SCENES) for name in options["scenes"].split(",")]
+    names = dict.fromkeys(one_of("scenes", name, SCENES) for name in options["scenes"].split(","))
     check_place(folder)
-    old = parsed(folder / FILE, _TEXTS) if (folder / FILE).is_file() else pd.DataFrame({"scene": []})
-    rows = []
+    scale, rows = options.get("scale", _SCALE), []
     for name in names:
-        scene = load_scene(name, [f"scale={options.get('scale', 'small')}"])
-        rows.append(
-            {"scene": name} | _row(scene, options.get("device", "cpu")) | _reduced(name, folder.parent)
-        )
-        say(f"{name}: " + ", ".join(f"{_COLUMNS[key]} {number(rows[-1][key], 100)}" for key in _COLUMNS))
-    frame = pd.concat([old[~old["scene"].isin(names)], pd.DataFrame(rows)])
+        scene = load_scene(name, [f"scale={scale}"])
+        rows.append({"scene": name, "scale": scale} | _row(scene, options.get("device", "cpu")))
+        stated = [f"{_COLUMNS[key]} {number(rows[-1][key], 100)}" for key in _COLUMNS if key in rows[-1]]
+        say(f"{name}: " + ", ".join(stated))
+    frame = pd.DataFrame(rows)
+    if (folder / FILE).is_file():
+        frame = pd.concat([parsed(folder / FILE, _TEXTS), frame])
+    frame = frame.drop_duplicates(["scene", "scale"], keep="last")
     order = {"key": lambda of: of.map(SCENES.index), "kind": "stable", "ignore_index": True}
     return _write(folder, frame.sort_values("scene", **order))
 
@@ -196,20 +202,33 @@ def _row(scene: Scene, device: str) -> dict:
         if device != "cpu" or finer.particle_count * finer.steps < _MOST:
             distances = exact.distances(run(finer, device, scene))
         row[name], row[f"{name}_stress"] = distances
-    row["order"] = observed_order(row["half"], row["third"])
-    row["grid"] = row["half"] / (1.0 - 2.0 ** -row["order"])
     other = run(second_sampling(scene), device).at(exact.X)
     row["sampling"], row["sampling_stress"] = exact.distances(other)
     return row | {"seconds": process_time() - start, "device": device, "commit": commit_text(provenance())}
 
 
-def _reduced(scene: str, reports: Path) -> dict:
-    """Errors of reduced runs of a scene in the table of all reports; empty where it has none."""
+def completed(frame: pd.DataFrame, reports: Path) -> pd.DataFrame:
+    """Distances with what follows from them, order and error of the grid, and the errors of reduced runs.
+
+    Args:
+        frame: a row a scene and scale.
+        reports: the folder with the table of all reports.
+    """
+    apart = (frame["third"] - frame["half"]).abs() > frame["sampling"]
+    pairs = zip(frame["half"], frame["third"], apart, strict=True)
+    order = pd.Series([observed_order(*pair) if far else np.nan for *pair, far in pairs], frame.index)
+    grid = frame["half"] / (1.0 - 2.0**-order)
+    reduced = [_reduced(*row, reports) for row in zip(frame["scene"], frame["scale"], strict=True)]
+    return frame.assign(order=order, grid=grid).join(pd.DataFrame(reduced, frame.index))
+
+
+def _reduced(scene: str, scale: str, reports: Path) -> dict:
+    """Errors of reduced runs of a scene in the table of all reports; NaN where it has none."""
     errors = {"": "displacement_error", "_stress": "stress_error"}
     names = {
         f"{model}{end}": (model, key) for model in ("projected", "recurrence") for end, key in errors.items()
     }
-    if not (reports / "results.csv").is_file():
+    if scale != _SCALE or not (reports / "results.csv").is_file():
         return dict.fromkeys(names, np.nan)
     table = pd.read_csv(reports / "results.csv", low_memory=False)
     table = table[(table["report"] == _REDUCED) & (table["scene"] == scene)]
@@ -217,17 +236,22 @@ def _reduced(scene: str, reports: Path) -> dict:
 
 
 def table(frame: pd.DataFrame) -> Rows:
-    """The table of the page and of the terminal."""
-    columns = {"scene": frame["scene"], "case": frame["case"], "cell [m]": frame["cell"].map(number)}
+    """The table of the page and of the terminal, of a completed frame."""
+    columns = {"scene": _titles(frame), "case": frame["case"], "cell [m]": frame["cell"].map(number)}
     columns |= {"order p": frame["order"].map(number)}
     columns |= {heading: frame[key].map(lambda x: number(x, 100)) for key, heading in _COLUMNS.items()}
     body = [list(row) for row in zip(*columns.values(), strict=True)]
     return Rows(list(columns), body, [heading not in ("scene", "case") for heading in columns])
 
 
+def _titles(frame: pd.DataFrame) -> pd.Series:
+    """The scene of each row, with its scale unless it is the usual one."""
+    return frame["scene"].where(frame["scale"] == _SCALE, frame["scene"] + ", " + frame["scale"])
+
+
 def terminal(page: Path) -> TerminalTable:
     """The table of a report for a terminal."""
-    return TerminalTable(table(parsed(page.with_name(FILE), _TEXTS)))
+    return TerminalTable(table(completed(parsed(page.with_name(FILE), _TEXTS), page.parent.parent)))
 
 
 def chart(frame: pd.DataFrame) -> Figure:
@@ -239,7 +263,7 @@ def chart(frame: pd.DataFrame) -> Figure:
             panel.plot(100.0 * frame[key], at, "o", color=color, label=title)
         panel.set(xscale="log", xlabel="displacement [%]", yticks=at, ylim=(len(frame) - 0.5, -0.5))
         panel.set(xlim=(0.01, 100.0), xticks=_TICKS, xticklabels=[f"{tick:g}" for tick in _TICKS])
-        panel.set_yticklabels(frame["scene"].str.replace("_", " "))
+        panel.set_yticklabels(_titles(frame).str.replace("_", " "))
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(_DRAWN))
         panel.grid(axis="x")
     return fig
@@ -247,20 +271,20 @@ def chart(frame: pd.DataFrame) -> Figure:
 
 def _write(folder: Path, frame: pd.DataFrame) -> Path:
     """The report of a table, whole or not at all."""
-    rows, made = table(frame), "; ".join(dict.fromkeys(frame["device"] + ", " + frame["commit"]))
+    full = completed(frame, folder.parent)
+    rows, made = table(full), "; ".join(dict.fromkeys(frame["device"] + ", " + frame["commit"]))
     with replaced(folder) as fresh:
         frame.to_csv(fresh / FILE, index=False)
-        save(chart(frame), fresh, "distances", kinds=("png",))
-        runs = frame[["scene", "particles", "seconds", "device", "commit"]]
+        save(chart(full), fresh, "distances", kinds=("png",))
+        runs = frame[["scene", "scale", "particles", "seconds", "device", "commit"]]
         body = [[number(value) for value in row] for row in runs.itertuples(index=False, name=None)]
-        runs = Rows(
-            ["scene", "particles", "CPU [s]", "device", "commit"], body, [False, True, True, False, False]
-        )
+        headings = ["scene", "scale", "particles", "host CPU [s]", "device", "commit"]
+        runs = Rows(headings, body, [heading in ("particles", "host CPU [s]") for heading in headings])
         page = Page(
             title="The grid's own error", lead=_LEAD, facts=[("Made", made)], warnings=[],
             tables=[Table("Distances", rows, _NOTE)],
             sections=[Section("Chart", [Picture(["distances.png"], _CHART, [])])],
-            provenance=Table("Scenes", runs, "Time of all runs of a scene."),
+            provenance=Table("Scenes", runs, "CPU time of the host over all runs of a scene."),
         )  # fmt: skip
         page.write(fresh)
         listed = vars(rows) | {"said": _NOTE, "made": made}

@@ -1,6 +1,7 @@
 """Scenes: loading, overrides, the problem parameter, what is refused."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -318,6 +319,19 @@ def test_bad_body(particles, density):
 
 
 CUBE = Box((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
+
+
+class TestCoarsened:
+    def test_has_as_many_steps_as_fill_the_time(self):
+        scene = replace(load_scene("sand"), steps=100)
+        assert scene.coarsened(0.5, 0.5).steps == 200
+        assert scene.coarsened(1.0 / 3.0, 1.0 / 3.0).steps == 300
+        assert scene.coarsened(1.0, 4).steps == 25
+
+    def test_refuses_a_step_that_does_not_divide_the_time(self):
+        scene = replace(load_scene("sand"), steps=100)
+        with pytest.raises(ConfigError, match=r"multiple=3 does not divide scene\.steps=100"):
+            scene.coarsened(1.0, 3)
 
 
 class TestParticlesPerCell:
