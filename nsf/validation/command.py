@@ -31,8 +31,8 @@ _OFF = (
     "next."
 )
 _SCENES = (
-    "Scenes stand in conf/scene. Values are as these sources are cited for them; their tables and figures "
-    "were not looked up."
+    "Scenes stand in conf/scene. Values are taken from works that cite these sources, not from the sources' "
+    "own tables."
 )
 _TICKS = (-50, -20, -10, -5, -2, -1, 0, 1, 2, 5, 10, 20, 50)
 _CHART = "How far off each quantity is; the band is 2 %."
@@ -54,9 +54,8 @@ def validate(folder: str | Path, options: Mapping[str, str], say: Callable[[str]
         DeviceError: the device does not exist.
     """
     folder, old = Path(folder), None
-    names = [
-        one_of("problems", name, PROBLEMS) for name in options.get("problems", ",".join(PROBLEMS)).split(",")
-    ]
+    problems = options.get("problems", ",".join(PROBLEMS)).split(",")
+    names = list(dict.fromkeys(one_of("problems", name, PROBLEMS) for name in problems))
     check_place(folder)
     if (folder / FILE).is_file():
         old = parsed(folder / FILE, _TEXTS)
@@ -99,9 +98,9 @@ def table(frame: pd.DataFrame) -> Rows:
     columns |= {"ours": frame["computed"].map(number), "off [%]": frame["off"].map(number)}
     for heading, key in (("cell [m]", "cell"), ("particles", "particles"), ("steps", "steps")):
         columns[heading] = frame[key].map(number)
-    columns["what limits it"] = frame["limit"].fillna("")
+    columns["limit"] = frame["limit"].fillna("")
     body = [list(row) for row in zip(*columns.values(), strict=True)]
-    texts = ("problem", "quantity", "what limits it")
+    texts = ("problem", "quantity", "limit")
     return Rows(list(columns), body, [heading not in texts for heading in columns])
 
 
@@ -160,9 +159,13 @@ def _write(folder: Path, frame: pd.DataFrame) -> Path:
 
 
 def _scenes(frame: pd.DataFrame) -> Rows:
-    """A row a problem: its scene, where its values are published, and the CPU time of all its runs."""
+    """A row a problem: its scene, where its values are published, and the host's CPU time of all its runs."""
     one = frame.drop_duplicates("problem")
-    columns = {"scene": one["problem"], "published": one["source"], "CPU [s]": one["seconds"].map(number)}
+    columns = {
+        "scene": one["problem"],
+        "published": one["source"],
+        "host CPU [s]": one["seconds"].map(number),
+    }
     columns |= {"device": one["device"], "commit": one["commit"]}
     body = [list(row) for row in zip(*columns.values(), strict=True)]
-    return Rows(list(columns), body, [heading == "CPU [s]" for heading in columns])
+    return Rows(list(columns), body, [heading == "host CPU [s]" for heading in columns])

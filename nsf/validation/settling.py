@@ -10,9 +10,8 @@ from nsf.validation.problem import Answer, relax, spread
 
 TITLE = "Column under its own weight"
 LIMITS = (
-    "the lowest cells, whose strain the floor holds: single particles are 6.1 % off with them, 2.1 % "
-    "above one cell, 1.0 % above two and 0.5 % above four. Particles spread as in other scenes are "
-    "noisy from the start: the last row."
+    "the lowest cells, whose strain the floor holds: single particles are 6.1 % off with them and 1.0 % "
+    "above two cells. Particles spread as in other scenes are noisy from the start: the last row."
 )
 _SOURCE = "closed form: equilibrium, σ = ρ₀ g (l₀ − y₀)"
 _HELD = 2  # cells above the floor that the second distance leaves out

@@ -94,7 +94,7 @@ def test_a_report_is_listed_and_keeps_the_rows_of_other_problems(tmp_path, monke
         problem = import_module(f"nsf.validation.{name}")
         answer = Answer("way", "m", (0.5,), "closed form", 0.51)
         monkeypatch.setattr(problem, "answers", lambda scene, finer, device, answer=answer: iter([answer]))
-        validate(tmp_path / "validation", {"problems": name}, said.append)
+        validate(tmp_path / "validation", {"problems": f"{name},{name}"}, said.append)
     rows = pd.read_csv(tmp_path / "validation/validation.csv")
     assert list(rows["problem"]) == ["settling", "incline"]
     assert list(rows["off"].round(9)) == [2.0, 2.0]
