@@ -114,7 +114,7 @@ def where_rivals_win(averages: pd.DataFrame) -> str:
             won.append(f"on {body} {' and '.join(nearer)} beside {_percent(best)}")
     if won:
         return f"A rival has a smaller displacement error than the best model: {'; '.join(won)}."
-    return "No rival has a smaller displacement error than the best model." if len(held) else ""
+    return "No rival comes nearer than the best model." if len(held) else ""
 
 
 def constants(frame: pd.DataFrame, names: Iterable[str]) -> dict[str, str]:
